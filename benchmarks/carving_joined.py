@@ -148,7 +148,7 @@ def solid_case(name: str, solid: Solid | None = None) -> Case:
         views.append(view)
         silhouettes.append(Silhouette(signed_distance(shown.cover), source="alpha"))
     low = np.full(3, -1.05)
-    return Case(name, _scene(dense_views), views, silhouettes, low, 2.1, surface_points(solid), solid, None)
+    return Case(name, scene_of(dense_views), views, silhouettes, low, 2.1, surface_points(solid), solid, None)
 
 
 def _color(view: View, depth: NDArray[np.float32], texture: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -173,7 +173,7 @@ def _color(view: View, depth: NDArray[np.float32], texture: NDArray[np.float32])
     return grey.reshape(depth.shape)
 
 
-def _scene(views: Sequence[DenseView]) -> DenseScene:
+def scene_of(views: Sequence[DenseView]) -> DenseScene:
     poses, focal = np.array([view.cam_from_world for view in views]), np.array([view.k[:2].mean() for view in views])
     no_points = np.zeros((0, 3)), np.zeros(1, np.int64), np.zeros(0, np.int32)
     neighbors, _ = select_neighbors(focal, poses, *no_points, MAX_NEIGHBORS)

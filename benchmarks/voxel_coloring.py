@@ -5,8 +5,9 @@
 
 Hull and carved volume are drawn alike: closed surfaces with a colour at each vertex by `carve/coloring.py`, seen twice
 as fine as the photograph and averaged; or cells with their mean colours. Every eighth of a solid's photographs is held
-out. The cell by which outlines are trusted was found on the lego's test views, and that the hull counts as one sight on
-these, the house, the jug and the first two that were drawn; the other three chose nothing.
+out, and every fourth of the temple's. The cell by which outlines are trusted was found on the lego's test views, and
+that the hull counts as one sight on these, the house, the jug and the first two that were drawn; the temple and the
+other three chose nothing.
 """
 
 from __future__ import annotations
@@ -26,18 +27,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from carving_joined import SOLIDS, Case, lego_case, solid_case
+from carving_joined import SOLIDS, Case, lego_case, scene_of, solid_case
 from machine import RESULTS, ROOT, describe_machine
 from plane_sweep import lego_views
 from rendered_worlds.lit_solids import drawn as drawn_solid
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
+from sfmapp.carve.box import find_box
 from sfmapp.carve.cell_grid import CellGrid, grid_of
 from sfmapp.carve.coloring import color_surface
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, join
 from sfmapp.carve.rendering import show_mesh
+from sfmapp.carve.silhouettes import MaskOptions, find_silhouettes
 from sfmapp.carve.space_carving import CarveOptions, carve_hull
 from sfmapp.carve.swept_sights import sights_by_colors
 from sfmapp.carve.views import View, view_of_camera
@@ -45,13 +48,17 @@ from sfmapp.carve.voxel_coloring import VoxelOptions, carve_by_color
 from sfmapp.dense.scene import DenseView
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.images.image_set import ImageSet
+from sfmapp.images.pixels import read_rgb
 from sfmapp.pipelines.carve.colors import JOIN
+from sfmapp.pipelines.carve.sources import find_views
 from sfmapp.scene.mesh import Mesh
+from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
-HELD_OUT = 8
+HELD_OUT, TEMPLE_HELD_OUT = 8, 4
 FINER = 2
 CELLS, SOLID_CELLS, VOXEL_CELLS = 256, 128, 128
 # drawn after everything was chosen, and looked at once
@@ -73,14 +80,30 @@ class Held:
 
 def split(case: Case) -> tuple[Case, Held]:
     """The case without the photographs that are held out; of the lego these are its test views."""
-    if case.solid is None:
+    if case.name == "lego":
         tests, _ = lego_views("test_cameras.json", 1.0)
         return case, Held([view_of(view) for view in tests], [view.rgb for view in tests], 255)
-    kept = [v for v in range(len(case.views)) if v % HELD_OUT]
-    held = Held(case.views[::HELD_OUT], [view.rgb for view in case.scene.views[::HELD_OUT]], 0)
+    each = HELD_OUT if case.solid is not None else TEMPLE_HELD_OUT
+    kept = [v for v in range(len(case.views)) if v % each]
+    held = Held(case.views[::each], [view.rgb for view in case.scene.views[::each]], 0)
     scene = replace(case.scene, views=tuple(case.scene.views[v] for v in kept))
     views, silhouettes = ([given[v] for v in kept] for given in (case.views, case.silhouettes))
     return replace(case, scene=scene, views=views, silhouettes=silhouettes), held
+
+
+def temple_case() -> Case:
+    """The temple's sparse ring: 16 photographs before black, silhouettes as the command finds them."""
+    source = find_views(DATA / "temple-sparse-ring", None, None, load_options())
+    views = list(source.views)
+    silhouettes, _ = find_silhouettes(ImageSet(source.records, ()), views, MaskOptions(), Events())
+    scene = []
+    for view, record, silhouette in zip(views, source.records, silhouettes, strict=True):
+        assert view.camera is not None
+        assert view.cam_from_world is not None
+        k = view.camera.k_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+        scene.append(DenseView(view.name, read_rgb(record), silhouette.inside, k, view.cam_from_world))
+    low, side = find_box(views, silhouettes).cube()
+    return Case("temple", scene_of(scene), views, silhouettes, low, side, np.zeros((0, 3)), None, None)
 
 
 def view_of(view: DenseView) -> View:
@@ -220,14 +243,15 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "voxel_coloring.json")
     args = parser.parse_args()
     runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
-    order = ["lego", *SOLIDS, *FRESH]
+    order = ["lego", "temple", *SOLIDS, *FRESH]
+    cases = {"lego": lambda: lego_case(Path(folder)), "temple": temple_case}
     names = [name for name in order if name.startswith(args.only)]
     with tempfile.TemporaryDirectory(prefix="colors-") as folder:
         for name in names:
             solid = drawn_solid(FRESH[name]) if name in FRESH else None
-            case, held = split(lego_case(Path(folder)) if name == "lego" else solid_case(name, solid))
+            case, held = split(cases[name]() if name in cases else solid_case(name, solid))
             runs = [old for old in runs if old["case"] != name]
-            for measured in (surfaces(case, held, CELLS if name == "lego" else SOLID_CELLS), voxels(case, held)):
+            for measured in (surfaces(case, held, CELLS if name in cases else SOLID_CELLS), voxels(case, held)):
                 for run in measured:
                     runs.append(run)
                     print(json.dumps(run, default=float), file=sys.stderr, flush=True)

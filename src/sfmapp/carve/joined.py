@@ -60,6 +60,8 @@ _ROUNDS = 3
 _MARGIN_PX = 1.0
 # what is put back along uncovered rays counts as so many sights
 _FILL_VOTES = 4.0
+# a photograph sees a surface that is turned this much towards it
+_LEAST_COSINE = 0.1
 _CHUNK = 1 << 15
 _RANGES = {"trust": positive(100.0), "keep": Range(0.0, 100.0)}
 
@@ -70,8 +72,8 @@ class JoinOptions:
 
     Attributes:
         trust: how much surface a sight of the band's width is worth; less is smoother and closes more.
-        keep: the hull counts as so many sights where it is full. With 0 the least surface closes what nothing tells;
-            the more it is, the more of the hull stays there.
+        keep: the hull counts as so many sights where a photograph sees it. With 0 the least surface closes what nothing
+            tells; the more it is, the more of the hull stays there.
     """
 
     trust: float = 1.5
@@ -230,7 +232,8 @@ def join(
             width = max(band, _BAND_CELLS * cell)
             level.votes = _votes(level.xyz, sights, width, pool)
             _hold_outside(level, width)
-            np.maximum(level.extra, np.float32(options.keep), out=level.extra, where=level.hull > 0.0)
+            if options.keep > 0.0:
+                _keep(level, evidence, options.keep, cell, pool)
             weight, iterations = options.trust * cell / band, _iterations(number)
             _solve(level, weight, iterations, events, pool)
             for _ in range(_ROUNDS):
@@ -328,6 +331,28 @@ def _hold_outside(level: _Level, band: float) -> None:
     """
     is_outside, is_told = level.hull <= 0.0, (level.votes[:, 1 : BINS - 1] > 0).any(axis=1)
     level.value[is_outside] = np.where(is_told, np.maximum(level.hull / band, -1.0), -1.0)[is_outside]
+
+
+def _keep(level: _Level, evidence: Evidence, keep: float, cell: float, pool: ThreadPoolExecutor) -> None:
+    """Votes for what is full in the hull, where its surface is turned towards a photograph.
+
+    Under an object that stands on a table the hull goes on as far as rays that pass by its rim, which nothing shows.
+    """
+    centers = np.array([view.center for view in evidence.views])
+    idx = np.flatnonzero(level.hull > 0.0)
+
+    def run(first: int, last: int) -> None:
+        part = idx[first:last]
+        xyz = level.xyz[part]
+        normal = evidence.hull.normals(xyz, cell, 1)
+        is_seen = np.zeros(len(part), np.bool_)
+        for center in centers:
+            way = center - xyz
+            is_seen |= (normal * way).sum(axis=1) > _LEAST_COSINE * np.linalg.norm(way, axis=1)
+        seen = part[is_seen]
+        level.extra[seen] = np.maximum(level.extra[seen], np.float32(keep))
+
+    _in_parts(run, len(idx), pool)
 
 
 def _in_parts(run: Callable[[int, int], None], num: int, pool: ThreadPoolExecutor) -> None:

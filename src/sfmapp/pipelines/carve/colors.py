@@ -19,7 +19,7 @@ _PIXEL_BYTES = 36.0
 # a photograph that is finer than so many pixels for a cell says no more
 _PIXELS_A_CELL = 2.0
 # Depths of plain surfaces are not told, and the least surface there cuts off what is the object's: it looked worse than
-# the hull. Against the hull, which counts as one sight, it takes two that agree.
+# the hull. Against the hull, which counts as one sight where photographs see it, it takes two that agree.
 JOIN = JoinOptions(keep=1.0)
 
 
