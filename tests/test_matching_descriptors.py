@@ -12,7 +12,7 @@ from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching import guided
 from sfmapp.matching.binary import match_binary
 from sfmapp.matching.descriptors import match_sift
-from sfmapp.matching.products import background_products, largest_products
+from sfmapp.matching.products import ProductSearch, background_products, largest_products
 from sfmapp.scene.features import Features
 
 
@@ -60,6 +60,20 @@ def test_products_are_exact_across_blocks() -> None:
     rows, columns = largest_products(a, b)
     for found, wanted in zip((*rows, *columns), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 200), st.integers(0, 200), st.lists(st.integers(0, 220), max_size=3), st.integers(0, 2**31))
+def test_a_search_that_is_carried_on_finds_what_one_at_once_does(n: int, m: int, sizes: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (rng.integers(0, 2, (num, 128)).astype(np.uint8) for num in (n, m))  # many are equal
+    search = ProductSearch(a, b)
+    for size in [*sorted(sizes), 220]:
+        found = search.among_first(size)
+        size = min(-(-size // 32) * 32, 220)
+        for side, wanted in zip(found, largest_products(a[:size], b[:size]), strict=True):
+            for array, expected in zip(side, wanted, strict=True):
+                np.testing.assert_array_equal(array, expected)
 
 
 def test_matches_are_mutual_and_pass_the_ratio_from_both_sides() -> None:

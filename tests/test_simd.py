@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sfmapp.simd import bilinear, f32x16, f64x8, i16x32
+from sfmapp.simd import bilinear, dots, f32x16, f64x8
 from sfmapp.simd.bits import count_bits
 from sfmapp.simd.pointers import Pointer, offset, pointer
 from sfmapp.simd.shared import shared_filler, shared_function
@@ -270,41 +270,88 @@ def test_pixels_at_whole_offsets_on_all_sides() -> None:
     np.testing.assert_array_equal(out, image[4 + v, 5 + u])
 
 
-# --------------------------------------------------------------------------------------------------------------- i16x32
+# ----------------------------------------------------------------------------------------------------------------- dots
 
 
 @numba.njit
-def _tile(a, packed, sums, masks, second1, second2, row, group):  # type: ignore[no-untyped-def]
-    i16x32.tile(a, packed, sums, masks, second1, second2, row, group)
+def _tile(a, packed, row, group, sums, masks, second1, second2):  # type: ignore[no-untyped-def]
+    return dots.tile(a, packed, row, group, sums, masks, second1, second2)
+
+
+def _packed(first: np.ndarray, second: np.ndarray, by_bytes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Both matrices as the tile reads them."""
+    row_type, group_type, offset, per_sum = (np.uint8, np.int8, 128, 4) if by_bytes else (np.int16, np.int16, 0, 2)
+    starts = (offset * first.sum(1)).astype(np.int32)[:, None].view(row_type)
+    groups = (second - offset).astype(group_type).reshape(-1, dots.LANES, dots.DIMS // per_sum, per_sum)
+    return np.concatenate([first.astype(row_type), starts], 1), np.ascontiguousarray(groups.transpose(0, 2, 1, 3))
 
 
 @pytest.mark.parametrize("largest", [255, 4000])
 @pytest.mark.parametrize("shift", [0, 1, 5])
 def test_a_tile_holds_the_products_and_marks_those_above_the_bounds(shift: int, largest: int) -> None:
     rng = np.random.default_rng(largest + shift)
-    rows, groups, lanes, dims = 3 * i16x32.ROWS, 2 * i16x32.GROUPS, i16x32.LANES, i16x32.DIMS
+    rows, groups, lanes, dims = 3 * dots.ROWS, 2 * dots.GROUPS, dots.LANES, dots.DIMS
     low = 0 if largest == 255 else -largest
-    first = rng.integers(low, largest + 1, (rows, dims)).astype(np.int16)
-    second = rng.integers(low, largest + 1, (groups * lanes, dims)).astype(np.int16)
-    products = first.astype(np.int64) @ second.astype(np.int64).T
+    first = rng.integers(low, largest + 1, (rows, dims))
+    second = rng.integers(low, largest + 1, (groups * lanes, dims))
+    products = first @ second.T
     assert np.abs(products).max() < 2**31
     bound1 = np.quantile(products, 0.8, axis=1).astype(np.int32)
     bound2 = np.quantile(products, 0.9, axis=0).astype(np.int32)
-    packed = second.reshape(groups, lanes, dims // 2, 2).transpose(0, 2, 1, 3)
-    for row in range(0, rows, i16x32.ROWS):
-        for group in range(0, groups, i16x32.GROUPS):
-            a = guarded(first, shift)[shift : shift + first.size].reshape(first.shape)
-            b = guarded(packed, shift)[shift : shift + packed.size].reshape(packed.shape)
-            room = np.full(i16x32.ROWS * i16x32.GROUPS * lanes + 2, 7, np.int32)
-            sums = room[1:-1].reshape(i16x32.ROWS, i16x32.GROUPS * lanes)
-            masks = np.zeros(i16x32.ROWS, np.uint32)
-            _tile(a, b, sums, masks, bound1, bound2, row, group)
-            i, j = np.arange(row, row + i16x32.ROWS), np.arange(group * lanes, (group + i16x32.GROUPS) * lanes)
-            block = products[np.ix_(i, j)]
-            np.testing.assert_array_equal(sums, block)
-            above = (block > bound1[i, None]) | (block > bound2[j])
-            np.testing.assert_array_equal(masks, (above << np.arange(len(j))).sum(axis=1))
-            assert room[0] == room[-1] == 7
+    bound1[: dots.ROWS] = products.max()
+    bound2[: dots.GROUPS * lanes] = products.max()  # the first tile has nothing to tell
+    has_bytes = np.int8 == dots.GROUP_TYPE
+    for by_bytes in (False, True) if has_bytes and largest == 255 else (False,):
+        a, b = (guarded(x, shift)[shift : shift + x.size].reshape(x.shape) for x in _packed(first, second, by_bytes))
+        for row in range(0, rows, dots.ROWS):
+            for group in range(0, groups, dots.GROUPS):
+                room = np.full(dots.ROWS * dots.GROUPS * lanes + 2, 7, np.int32)
+                sums, masks = room[1:-1].reshape(dots.ROWS, dots.GROUPS * lanes), np.zeros(dots.ROWS, np.uint32)
+                is_any = _tile(a, b, row, group, sums, masks, bound1, bound2)
+                i, j = np.arange(row, row + dots.ROWS), np.arange(group * lanes, (group + dots.GROUPS) * lanes)
+                block = products[np.ix_(i, j)]
+                above = (block > bound1[i, None]) | (block > bound2[j])
+                np.testing.assert_array_equal(masks, (above << np.arange(len(j))).sum(axis=1))
+                assert is_any == above.any() == ((row, group) != (0, 0))
+                np.testing.assert_array_equal(sums, block if is_any else 7)
+                assert room[0] == room[-1] == 7
+
+
+@numba.njit
+def _best(a, packed, best1, best2):  # type: ignore[no-untyped-def]
+    for row in range(0, len(a), dots.ROWS):
+        for group in range(0, len(packed), dots.GROUPS):
+            dots.tile_of_best(
+                a, packed, row, group, best1[row : row + dots.ROWS], best2, row + 10 + dots.BLOCK * (group + 2)
+            )
+
+
+@numba.njit
+def _two_largest(best):  # type: ignore[no-untyped-def]
+    found = np.empty((len(best), 2), np.int32)
+    for i in range(len(best)):
+        found[i, 0], found[i, 1] = dots.two_largest_lanes(best, i)
+    return found
+
+
+@pytest.mark.parametrize("by_bytes", [False, True])
+def test_the_best_of_a_block_are_those_of_a_sort(by_bytes: bool) -> None:
+    if by_bytes and np.int8 != dots.GROUP_TYPE:
+        pytest.skip("the processor has no products of bytes")
+    rng = np.random.default_rng(3)
+    rows, columns = 3 * dots.ROWS, 2 * dots.GROUPS * dots.LANES
+    first, second = rng.integers(0, 256, (rows, dots.DIMS)), rng.integers(0, 256, (columns, dots.DIMS))
+    first[1], second[0], second[5] = 255, 255, 255  # the largest that there can be, twice
+    best1 = np.zeros((rows, 2, dots.LANES), np.int32)
+    best2 = np.zeros((2 * dots.GROUPS + 2, 2, dots.LANES), np.int32)
+    _best(*_packed(first, second, by_bytes), best1, best2)
+    assert not best2[:2].any()
+    products = first @ second.T
+    row_ids, column_ids = np.arange(rows) + 10, np.arange(columns) + 2 * dots.LANES
+    of_rows = np.sort(256 * products + 255 - column_ids, 1)[:, :-3:-1]
+    of_columns = np.sort(256 * products.T + 255 - row_ids, 1)[:, :-3:-1]
+    np.testing.assert_array_equal(_two_largest(best1), of_rows)
+    np.testing.assert_array_equal(best2[2:].transpose(0, 2, 1).reshape(-1, 2), of_columns)
 
 
 # ----------------------------------------------------------------------------------------------------------------- bits

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import UsageError
 from sfmapp.simd import u8x64 as u8
+from sfmapp.simd.bits import first_bit
 from sfmapp.simd.pointers import pointer
 from sfmapp.stereo import Matcher, semiglobal
 from sfmapp.stereo import semiglobal_kernels as kernels
@@ -42,7 +43,7 @@ def _operate(a: Grey, b: Grey, words: Any, out: Grey, costs: Grey, labels: Any) 
     u8.store(po, 704, u8.within(x, 60, 99, y))
     u8.store(po, 576, u8.count_differences(words[70], pointer(words), 3))
     u8.keep_lower(x, np.int16(-7), pointer(costs), pointer(labels), 2)
-    return u8.lowest(x), u8.first_bit(u8.lanes_equal(x, u8.splat(a[40]))), u8.first_bit(np.uint64(0))
+    return u8.lowest(x), first_bit(u8.lanes_equal(x, u8.splat(a[40]))), first_bit(np.uint64(0))
 
 
 def test_vectors_of_bytes_are_numpys() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.simd import u8x64 as u8
+from sfmapp.simd.bits import first_bit
 from sfmapp.simd.pointers import Index, Pointer, pointer
 from sfmapp.stereo.semiglobal_kernels import (
     GAP,
@@ -135,7 +136,7 @@ def decide(views: Views, band: tuple[int, int], rows: Rows, found: Found) -> Non
             value = u8.add(u8.load(above, LANES * x), u8.load(below, LANES * x))
             u8.store(above, LANES * x, value)
             best = u8.lowest(value)
-            k = u8.first_bit(u8.lanes_equal(value, u8.splat(best)))
+            k = first_bit(u8.lanes_equal(value, u8.splat(best)))
             found.best[y, x] = best
             found.elsewhere[y, x] = u8.lowest(u8.hide(value, k))
             shift, bend = np.float32(0.0), np.int64(0)

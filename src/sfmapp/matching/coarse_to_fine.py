@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from sfmapp.errors import InputError
 from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.binary import match_binary
-from sfmapp.matching.descriptors import match_sift
+from sfmapp.matching.descriptors import mutual_neighbors
 from sfmapp.matching.euclidean import match_euclidean
 from sfmapp.matching.guided import GuidedImage, change_of_shape, match_guided
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.products import Ints
+from sfmapp.matching.products import Ints, ProductSearch
 from sfmapp.matching.search import Ransac, find_fundamental, is_significant
 from sfmapp.matching.second_motion import has_second_motion
 from sfmapp.scene.features import DescriptorMetric, Features
@@ -70,14 +70,16 @@ def match_features(
     if metric != DescriptorMetric.ROOT_SIFT:
         match = match_binary if metric == DescriptorMetric.HAMMING else match_euclidean
         return Putative(match(first, second, options.max_ratio, options.max_distance))
-    num_coarse = None
+    search, limits, num_coarse = ProductSearch(first, second), (options.max_ratio, options.max_distance), None
     if backgrounds[0] is not None and backgrounds[1] is not None:
         images = GuidedImage.of(features[0], backgrounds[0]), GuidedImage.of(features[1], backgrounds[1])
-        found = _match_coarse_to_fine(*images, threshold_px, options, ransac)
-        if found.fundamental is not None:
+        coarse = mutual_neighbors(*search.among_first(options.coarse_features), *limits)
+        found = _match_coarse_to_fine(*images, coarse, threshold_px, options, ransac)
+        if found is not None:
             return found
-        num_coarse = found.num_coarse
-    return Putative(match_sift(first, second, options.max_ratio, options.max_distance), None, num_coarse)
+        num_coarse = len(coarse)
+    best = search.among_first(max(len(first), len(second)))
+    return Putative(mutual_neighbors(*best, *limits), None, num_coarse)
 
 
 def _common_metric(first: Features, second: Features) -> DescriptorMetric:
@@ -91,33 +93,36 @@ def _common_metric(first: Features, second: Features) -> DescriptorMetric:
 
 
 def _match_coarse_to_fine(
-    image1: GuidedImage, image2: GuidedImage, threshold_px: float, options: MatchingOptions, ransac: Ransac
-) -> Putative:
-    """Guided matches, or, without a fundamental matrix, the coarse ones where these are not to be trusted."""
-    size, limits = options.coarse_features, (options.max_ratio, options.max_distance)
-    coarse = match_sift(image1.descriptors[:size], image2.descriptors[:size], *limits)
-    doubtful = Putative(coarse, None, len(coarse))
+    image1: GuidedImage,
+    image2: GuidedImage,
+    coarse: NDArray[np.int32],
+    threshold_px: float,
+    options: MatchingOptions,
+    ransac: Ransac,
+) -> Putative | None:
+    """Matches of all features guided by coarse ones (K, 2), those of the largest of each image; None where these
+    are not to be trusted."""
     if len(coarse) < max(options.min_inliers, 8):
-        return doubtful
+        return None
     xy1, xy2 = _points(image1, image2, coarse)
     fundamental = find_fundamental(xy1, xy2, threshold_px, ransac)
     if fundamental is None:
-        return doubtful
+        return None
     fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
     extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
     if inlier.sum() < max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse)):
-        return doubtful
+        return None
     if not is_significant(inlier, threshold_px, extent):
-        return doubtful
+        return None
     if has_second_motion(xy1, xy2, inlier, threshold_px, extent, options, ransac):
-        return doubtful
-    change = change_of_shape(image1, image2, coarse[inlier])
+        return None
+    change, limits = change_of_shape(image1, image2, coarse[inlier]), (options.max_ratio, options.max_distance)
     guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)
     xy1, xy2 = _points(image1, image2, guided)
     fundamental, guided_inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
-    promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / size
+    promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / options.coarse_features
     if guided_inlier.sum() < _MIN_KEPT_PROMISE * promise:
-        return doubtful
+        return None
     return Putative(guided, fundamental, len(coarse))
 
 

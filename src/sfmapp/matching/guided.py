@@ -19,6 +19,7 @@ from sfmapp.matching.descriptors import mutual_neighbors
 from sfmapp.matching.products import (
     Best,
     Ints,
+    Packed,
     TileRoom,
     background_products,
     keep_two_largest,
@@ -27,7 +28,8 @@ from sfmapp.matching.products import (
     pack_rows,
 )
 from sfmapp.scene.features import Features
-from sfmapp.simd.i16x32 import DIMS, GROUPS, LANES, ROWS, tile
+from sfmapp.simd.bits import first_bit
+from sfmapp.simd.dots import DIMS, GROUPS, LANES, ROWS, tile
 
 Array = NDArray[np.float64]
 
@@ -212,11 +214,11 @@ class _Lines(NamedTuple):
     """The features of image 1 in the order of their angles.
 
     Attributes:
-        packed: (N', 128) int16 descriptors, see ``pack_rows``.
+        packed: (N', ...) descriptors, see ``pack_rows``.
         lines: (N, 3) in image 2. shape: (N, 4). low, high: (N,) angles, see :class:`_Rows`.
     """
 
-    packed: NDArray[np.int16]
+    packed: Packed
     lines: Array
     shape: Array
     low: Array
@@ -226,7 +228,7 @@ class _Lines(NamedTuple):
 class _Points(NamedTuple):
     """Those of image 2: packed descriptors, see ``pack_groups``, shape (M, 4) and angle (F,), see :class:`_Columns`."""
 
-    packed: NDArray[np.int16]
+    packed: Packed
     shape: Array
     angle: Array
 
@@ -251,14 +253,15 @@ def _scan_run(
     first2, second2, partner2 = best2
     sums, masks = room
     for group in range(first // width * GROUPS, (last + width - 1) // width * GROUPS, GROUPS):
-        tile(a, packed, sums, masks, second1, second2, row, group)
+        if not tile(a, packed, row, group, sums, masks, second1, second2):
+            continue
         for r in range(ROWS):
-            if masks[r] == 0:
-                continue
-            i = row + r
-            for q in range(max(first - group * LANES, 0), min(last - group * LANES, width)):
+            i, left = row + r, masks[r]
+            while left != 0:
+                q = first_bit(np.uint64(left))
+                left &= left - np.uint32(1)
                 j = group * LANES + q
-                if (masks[r] >> np.uint32(q)) & np.uint32(1) == 0:
+                if j < first or j >= last:
                     continue
                 if abs(lines[i, 0] * shape2[j, 0] + lines[i, 1] * shape2[j, 1] + lines[i, 2]) > band:
                     continue

@@ -1,9 +1,10 @@
-"""Counting bits."""
+"""Counting and finding bits."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
@@ -16,3 +17,13 @@ def count_bits(typingctx: Any, word: Any) -> Any:
         return builder.ctpop(args[0])
 
     return types.uint64(types.uint64), codegen
+
+
+@intrinsic
+def first_bit(typingctx: Any, word: Any) -> Any:
+    """Position of the lowest bit of a uint64 that is set, 64 if none is."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))
+
+    return types.int64(types.uint64), codegen

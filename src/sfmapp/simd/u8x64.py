@@ -187,16 +187,6 @@ def lanes_equal(typingctx: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
-def first_bit(typingctx: Any, word: Any) -> Any:
-    """Position of the lowest bit of a uint64 that is set, 64 if none is."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))
-
-    return types.int64(types.uint64), codegen
-
-
-@intrinsic
 def hide(typingctx: Any, a: Any, lane: Any) -> Any:
     """``a`` with 255 in a lane and in those beside it."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.simd import u8x64 as u8
+from sfmapp.simd.bits import first_bit
 from sfmapp.simd.pointers import Index, Pointer, offset, pointer
 
 LANES = u8.WIDTH
@@ -313,7 +314,7 @@ def decide(
             if last_seen >= 0 and (last_seen < LANES - 1 or last_seen >= width):
                 seen = u8.within(value, last_seen - width + 1, last_seen + 1, u8.splat(np.uint8(255)))
             best = u8.lowest(seen)
-            k = u8.first_bit(u8.lanes_equal(seen, u8.splat(best)))
+            k = first_bit(u8.lanes_equal(seen, u8.splat(best)))
             found.best[y, x] = best
             found.elsewhere[y, x] = u8.lowest(u8.hide(value, k))
             found.bend[y, x] = np.int16(k)
