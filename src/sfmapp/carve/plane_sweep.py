@@ -2,9 +2,10 @@
 
 A plane brings the neighbours' pictures to the reference's by a homography; where it meets the surface they look alike.
 Planes are even in inverse depth, a pixel of the usual neighbour apart. Costs, paths, levels and tests of a match are
-those of :mod:`sfmapp.stereo.semiglobal`, and sigma and confidence those of :mod:`sfmapp.stereo.disparity_error`, for a
-plane more is a pixel of disparity more. Of several neighbours the better two count, so that what is hidden from some is
-told by others.
+those of :mod:`sfmapp.stereo.semiglobal`; of several neighbours the better two count, so that what is hidden from some
+is told by others. A slanted plane of each pixel takes it from there (:mod:`sfmapp.carve.slanted_sweep`). Sigma and
+confidence go by the cues of :mod:`sfmapp.stereo.disparity_error`, for a plane more is a pixel of disparity more, by a
+table of swept scenes, and by how far the sparse points are off the map.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.slanted_kernels import take_islands
+from sfmapp.carve.slanted_sweep import carried_on, slanted_planes
+from sfmapp.carve.sweep_error_table import ERROR_TABLE
 from sfmapp.carve.sweep_kernels import UNSEEN_WORD, Neighbours, decide, fill_costs
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.dense.selection import MIN_SHARED, meeting_point
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry import rigid3
 from sfmapp.images.pixels import as_gray
-from sfmapp.stereo.disparity_error import correlations, cues_of
-from sfmapp.stereo.error_table import ERROR_TABLE
+from sfmapp.stereo.disparity_error import correlations, cues_of, with_residual
 from sfmapp.stereo.matcher import BLANK, ISLAND_STEP_PX, LEAST_ISLAND
 from sfmapp.stereo.semiglobal import (
     BLANK_WINDOW,
@@ -60,7 +63,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 # neighbours that a view is swept with
-NEIGHBORS = 4
+NEIGHBORS = 6
 # Of the inverse depths of a view's sparse points these quantiles, and so much on both sides of them as a share of their
 # own: points are where corners are, and the ground in front of them and the sky behind them are not
 _QUANTILES, _BEYOND = (0.01, 0.99), (0.6, 1.5)
@@ -69,11 +72,15 @@ _AROUND_MEETING = (0.4, 2.5)
 # 1 - best / second of an answer: half of what a pair asks for, as several photographs outvote one that fits by chance,
 # and other views' maps are there to contradict. Of what is textured on a courtyard a tenth more is answered
 LEAST_ANSWER = 0.5 * LEAST_UNIQUENESS
+# NCC of the photographs that fit best: of pictures of noise 6 per cent reach it, and next to none in islands
+LEAST_SCORE = 0.3
 # with an equal noise in all pictures the zero-mean NCC is the share of what they have in common in the variance: below
 # half of it the rest is more
 LEAST_CORRELATION = 0.5
-# second difference of correlations below which a peak is noise
-_LEAST_CURVATURE = 1e-2
+# how often the scatter is taken out of planes: three times, a point more is right within 1 % on rendered scenes
+_EVENED = 3
+# sparse points of a view that tell what its cameras leave: their share inside is then known to 7 per cent
+LEAST_POINTS = 50
 # planes, times the shorter side in pixels
 _MOST_PLANES = 4.0
 # a picture brought to the reference's reaches so far beyond it, as a share of its sides
@@ -109,6 +116,7 @@ class SweptDepth:
     Attributes:
         depth: along the axis, units of the world.
         sigma: 68 per cent of such depths are off by less, units of the world.
+        half_width_95: 95 per cent are off by less.
         confidence: share of such depths that are off by less than a plane, 0 to 1; 0 where there is none.
         plane: number of the plane, with fractions.
         planes: that were looked at.
@@ -117,6 +125,7 @@ class SweptDepth:
 
     depth: Map
     sigma: Map
+    half_width_95: Map
     confidence: Map
     plane: Map
     planes: Planes
@@ -143,18 +152,21 @@ def sweep_view(scene: DenseScene, view_idx: int, pool: Executor | None = None) -
         )
     others = [scene.views[m] for m in chosen]
     planes = _planes(scene, view_idx, others)
-    plane = _between_planes(reference, others, planes, _Level(reference, others, planes).answers(pool))
-    return _measured(reference, others, chosen, planes, plane)
+    plane = _slanted(reference, others, planes, pool)
+    return _measured(scene, view_idx, chosen, planes, plane)
 
 
 def _planes(scene: DenseScene, view_idx: int, others: list[DenseView]) -> Planes:
     """From the sparse points of a view, or from where the cameras look."""
     reference = scene.views[view_idx]
     seen = np.repeat(np.arange(len(scene.point_xyz)), np.diff(scene.point_ptr))[scene.point_view_idx == view_idx]
-    depth = rigid3.apply(reference.cam_from_world, scene.point_xyz[seen])[:, 2]
-    depth = depth[depth > 0.0]
-    if len(depth) >= MIN_SHARED:
-        near_far = np.quantile(1.0 / depth, _QUANTILES) * _BEYOND
+    pixel, depth = reference.project(scene.point_xyz)
+    own = depth[seen][depth[seen] > 0.0]
+    if len(own) >= MIN_SHARED:
+        # what others see in its direction may show as well, farther than anything that it shares with them
+        in_frame = depth[reference.shows(pixel)]
+        far = min(np.quantile(1.0 / values, _QUANTILES[0]) for values in (own, in_frame))
+        near_far = np.array([far, np.quantile(1.0 / own, _QUANTILES[1])]) * _BEYOND
     else:
         axes = rigid3.rotation_matrix(scene.cam_from_world)[:, 2]
         target = rigid3.apply(reference.cam_from_world, meeting_point(scene.centers, axes)[None])[0, 2]
@@ -246,19 +258,19 @@ class _Level:
         sums: NDArray[np.uint16] = cv2.boxFilter(fine, cv2.CV_16U, (side, side), normalize=False)
         return sums
 
-    def answers(self, pool: Executor | None) -> Map:
-        """Planes (H, W) of the pixels that are believed, NaN elsewhere."""
+    def answers(self, pool: Executor | None) -> tuple[Map, Map]:
+        """Planes (H, W) of all pixels within the mask, and of those that are believed, NaN elsewhere."""
         found = self.match(pool)
         shape = self.grey.shape
-        kept, plane, state = np.empty(shape, np.int16), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        kept, sure, state = np.empty(shape, np.int16), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        anywhere = found.disparity.copy()
         blank = BLANK * BLANK_WINDOW**2
         collect(found, LEAST_ANSWER, self.texture(BLANK_WINDOW), blank, (0, self.planes.count), kept)
         if self.reference.mask is not None:
-            kept[~self.reference.mask] = -32768
+            kept[~self.reference.mask], anywhere[~self.reference.mask] = -32768, np.nan
         cv2.filterSpeckles(kept, -32768, LEAST_ISLAND, 16 * ISLAND_STEP_PX)
-        report(found, kept, plane, state, np.empty((3, *shape), np.float32))
-        even_out(plane, np.empty_like(plane))
-        return plane
+        report(found, kept, sure, state, np.empty((3, *shape), np.float32))
+        return anywhere, sure
 
 
 def _halved(view: DenseView) -> DenseView:
@@ -319,36 +331,64 @@ def _box(reference: DenseView, epipole: Array, reach: float) -> tuple[int, int, 
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def _between_planes(reference: DenseView, others: list[DenseView], planes: Planes, plane: Map) -> Map:
-    """Planes (H, W) moved to where the mean of the neighbours' pictures correlates best, by a parabola: the census is
-    taken at the nearest pixel, and so knows its place to a part of one only by its own neighbours. NaN where they
-    correlate by less than LEAST_CORRELATION: no two sides have to agree here, as those of a pair do."""
+def _slanted(reference: DenseView, others: list[DenseView], planes: Planes, pool: Executor | None) -> Map:
+    """Planes (H, W) of the pixels that are believed, NaN elsewhere: those that correlate in the photographs that fit
+    best, or, where the sweep alone is sure, in the mean of all, and what lies close beside them."""
+    anywhere, sure = _Level(reference, others, planes).answers(pool)
+    plane, slopes, score = slanted_planes(reference, others, planes.first, planes.step, anywhere, sure, pool)
+    known = np.isfinite(sure)
+    safe = np.where(known, plane, np.float32(0.0))
+    grey = as_gray(reference.rgb).astype(np.float32)
+    (_, here, _), _ = correlations(grey, _seen_by_others(reference, others, planes, safe), known)
+    believed = (score >= LEAST_SCORE) | (known & (here >= LEAST_CORRELATION))
+    take_islands(plane, slopes, believed, LEAST_ISLAND)
+    plane = carried_on(plane, slopes, believed)
+    for _ in range(_EVENED):
+        even_out(plane, np.empty_like(plane))
+    return plane
+
+
+def swept_cues(reference: DenseView, others: list[DenseView], planes: Planes, plane: Map) -> Map:
+    """The cues (9, H, W) of :mod:`sfmapp.stereo.disparity_error` of planes (H, W), NaN where there is none."""
     known = np.isfinite(plane)
     safe = np.where(known, plane, np.float32(0.0))
     grey = as_gray(reference.rgb).astype(np.float32)
-    (farther, here, nearer), _ = correlations(grey, _seen_by_others(reference, others, planes, safe), known)
-    curvature = 2.0 * here - farther - nearer
-    is_peak = (here >= farther) & (here >= nearer) & (curvature > _LEAST_CURVATURE)
-    shift = np.where(is_peak, 0.5 * (nearer - farther) / np.where(is_peak, curvature, 1.0), np.float32(0.0))
-    moved = np.where(here >= LEAST_CORRELATION, plane + shift, np.float32(np.nan)).astype(np.float32)
-    even_out(moved, np.empty_like(moved))
-    return moved
+    return cues_of(grey, _seen_by_others(reference, others, planes, safe), safe, known)
 
 
-def _measured(
-    reference: DenseView, others: list[DenseView], chosen: tuple[int, ...], planes: Planes, plane: Map
-) -> SweptDepth:
+def _measured(scene: DenseScene, view_idx: int, chosen: tuple[int, ...], planes: Planes, plane: Map) -> SweptDepth:
     """Depth with its sigma and confidence of the planes that are believed."""
     known = np.isfinite(plane)
-    safe = np.where(known, plane, np.float32(0.0))
-    grey = as_gray(reference.rgb).astype(np.float32)
-    cues = cues_of(grey, _seen_by_others(reference, others, planes, safe), safe, known)
-    sigma, _, confidence = ERROR_TABLE.read(cues)
+    told = ERROR_TABLE.read(swept_cues(scene.views[view_idx], [scene.views[m] for m in chosen], planes, plane))
+    residual = _residual(scene, view_idx, planes, plane, told[0])
+    sigma, half_width, confidence = with_residual(told, residual)
     depth = planes.depth(plane)
-    # of 1 / w with the sigma of w
-    sigma = np.where(known, sigma * planes.step * depth * depth, np.float32(np.nan)).astype(np.float32)
+    # of 1 / w with those of w
+    sigma, half_width = (
+        np.where(known, width * planes.step * depth * depth, np.float32(np.nan)).astype(np.float32)
+        for width in (sigma, half_width)
+    )
     confidence = np.where(known, confidence, np.float32(0.0))
-    return SweptDepth(depth, sigma, confidence, plane, planes, chosen)
+    return SweptDepth(depth, sigma, half_width, confidence, plane, planes, chosen)
+
+
+def _residual(scene: DenseScene, view_idx: int, planes: Planes, plane: Map, sigma: Map) -> float:
+    """Standard deviation of what cameras leave of planes, which no cue tells: so much more, in planes, that 68 per cent
+    of the sparse points of a view lie inside. Points are in all of their photographs at once, and so off by little of
+    what one pair of cameras is; what they are is counted as the map's. Zero where there are too few to tell."""
+    view = scene.views[view_idx]
+    seen = np.repeat(np.arange(len(scene.point_xyz)), np.diff(scene.point_ptr))[scene.point_view_idx == view_idx]
+    pixel, depth = view.project(scene.point_xyz[seen])
+    inside = view.shows(pixel)
+    x, y = pixel[inside].astype(np.int64).T
+    off = (1.0 / depth[inside] - planes.first) / planes.step - plane[y, x]
+    told = sigma[y, x]
+    usable = np.isfinite(off)
+    if usable.sum() < LEAST_POINTS:
+        return 0.0
+    # 68 per cent of the points ask for no more
+    excess = np.square(off[usable]) - np.square(told[usable].astype(np.float64))
+    return float(np.sqrt(max(np.quantile(excess, 0.68), 0.0)))
 
 
 def _seen_by_others(reference: DenseView, others: list[DenseView], planes: Planes, plane: Map) -> Iterator[Map]:

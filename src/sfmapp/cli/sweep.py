@@ -28,6 +28,7 @@ SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model with the folder o
   DIR/maps/NAME.depth.npy       (H, W) float32, along the axis of the undistorted photograph, units of the world; NaN
                                 where it is not known
   DIR/maps/NAME.sigma.npy       how far off it may be: 68 per cent of the depths are off by less
+  DIR/maps/NAME.half_width_95.npy  the same of 95 per cent
   DIR/maps/NAME.confidence.npy  share of such depths that are off by less than a plane, 0 to 1
   DIR/maps/NAME.depth.png       to look at: near is red
   DIR/maps/views.json           size, calibration and pose of each map

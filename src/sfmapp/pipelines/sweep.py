@@ -38,6 +38,8 @@ STAGE = SWEEP
 MAPS = "maps"
 # where maps wait until others have confirmed them
 _UNCONFIRMED = "unconfirmed"
+# of a map, in the order of SweptDepth
+_ARRAYS = ("depth", "sigma", "half_width_95", "confidence")
 Map = NDArray[np.float32]
 
 
@@ -82,8 +84,9 @@ def sweep(
 ) -> SweepResult:
     """Write a depth map of every photograph of a model, with sigma and confidence.
 
-    ``OUTPUT/maps`` gets ``NAME.depth.npy``, ``NAME.sigma.npy`` (H, W) float32 in units of the world, NaN where nothing
-    is known, ``NAME.confidence.npy``, a picture ``NAME.depth.png``, and ``views.json`` with the cameras of the maps.
+    ``OUTPUT/maps`` gets ``NAME.depth.npy``, ``NAME.sigma.npy``, ``NAME.half_width_95.npy`` (H, W) float32 in units of
+    the world, NaN where nothing is known, ``NAME.confidence.npy``,
+    a picture ``NAME.depth.png``, and ``views.json`` with the cameras of the maps.
 
     Args:
         source: a workspace, or the folder of a COLMAP model.
@@ -157,11 +160,12 @@ def _sweep_all(job: _Job) -> None:
                 continue
             finally:
                 events.advanced(STAGE)
-            for what, values in (("depth", found.depth), ("sigma", found.sigma), ("confidence", found.confidence)):
+            arrays = found.depth, found.sigma, found.half_width_95, found.confidence
+            for what, values in zip(_ARRAYS, arrays, strict=True):
                 write_array(job.waiting(view, what), values)
             nothing = np.empty((0, 0), np.float32)
             names = tuple(int(wanted[m]) for m in found.neighbors)
-            job.swept.append(SweptDepth(nothing, nothing, nothing, nothing, found.planes, names))
+            job.swept.append(SweptDepth(nothing, nothing, nothing, nothing, nothing, found.planes, names))
     events.finished(STAGE, f"{len(plan.records) - len(job.left_out)} maps")
     if job.left_out:
         events.warned(STAGE, f"{len(job.left_out)} photographs have no map: {job.left_out[0].reason}")
@@ -181,10 +185,12 @@ def _confirm_all(job: _Job) -> list[SweptView]:
         sides = [m for m in plan.neighbors[view] if m >= 0 and job.swept[m] is not None]
         agree, against = confirm(_camera(plan, view), own, [_other(job, int(m)) for m in sides])
         kept = (agree > 0) & (agree >= against)
-        depth, sigma = (np.where(kept, values, np.float32(np.nan)) for values in (own.depth, own.sigma))
+        depth, sigma, half_width = (
+            np.where(kept, values, np.float32(np.nan)) for values in (own.depth, own.sigma, own.half_width_95)
+        )
         base = job.workspace.folder / MAPS / plan.names[view]
         confidence = np.where(kept, own.confidence, np.float32(0.0))
-        for what, values in (("depth", depth), ("sigma", sigma), ("confidence", confidence)):
+        for what, values in zip(_ARRAYS, (depth, sigma, half_width, confidence), strict=True):
             write_array(base.with_name(f"{base.name}.{what}.npy"), values)
         write_picture(base.with_name(f"{base.name}.depth.png"), depth_picture(depth))
         farthest, nearest = swept.planes.depth(np.array([0, swept.planes.count - 1]))
@@ -199,15 +205,15 @@ def _confirm_all(job: _Job) -> list[SweptView]:
 
 
 def _map(job: _Job, view: int, swept: SweptDepth) -> SweptDepth:
-    depth, sigma, confidence = (np.load(job.waiting(view, what)) for what in ("depth", "sigma", "confidence"))
-    return SweptDepth(depth, sigma, confidence, depth, swept.planes, swept.neighbors)
+    depth, sigma, half_width, confidence = (np.load(job.waiting(view, what)) for what in _ARRAYS)
+    return SweptDepth(depth, sigma, half_width, confidence, depth, swept.planes, swept.neighbors)
 
 
 def _other(job: _Job, view: int) -> tuple[DenseView, SweptDepth]:
     swept = job.swept[view]
     assert swept is not None
     depth = np.load(job.waiting(view, "depth"))
-    return _camera(job.plan, view), SweptDepth(depth, depth, depth, depth, swept.planes, swept.neighbors)
+    return _camera(job.plan, view), SweptDepth(depth, depth, depth, depth, depth, swept.planes, swept.neighbors)
 
 
 def _camera(plan: DensePlan, view: int) -> DenseView:

@@ -49,7 +49,7 @@ REACH = 3
 
 
 @numba.njit(cache=True, nogil=True)
-def _slope(values: Pointer, step: Index) -> float:
+def slope_along(values: Pointer, step: Index) -> float:
     """Pixels per pixel along a step, from pairs on opposite sides whose mean is the value in the middle."""
     total, weights = f32(0.0), f32(0.0)
     for n in range(1, REACH + 1):
@@ -84,7 +84,7 @@ def refine_rows(
             if not inside or not np.isfinite(first):
                 continue
             here = offset(values, y * width + x)
-            start_a, start_b = _slope(here, 1), _slope(here, width)
+            start_a, start_b = slope_along(here, 1), slope_along(here, width)
             if read_reference(source, width, x, y, f32(contrast), work) <= f32(0.0):
                 continue
             d, a, b = first, start_a, start_b
