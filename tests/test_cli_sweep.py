@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sfmapp.pipelines.sweep.run as sweep_pipeline
 from dense_models import DEPTH, write_wall
 from schemas import check_schema
+from sfmapp.carve.plane_sweep import SweptDepth
 from sfmapp.cli.main import main
+from sfmapp.dense.scene import DenseScene
 from sfmapp.geometry import rigid3
 
 
@@ -69,3 +74,41 @@ def test_bytes_do_not_depend_on_threads(wall: Path, tmp_path: Path) -> None:
 def test_what_is_no_model_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sweep", str(tmp_path), "-o", str(tmp_path / "out")]) != 0
     assert "expected a workspace of sfmapp or a COLMAP model" in capsys.readouterr().err
+
+
+def test_a_call_that_was_stopped_goes_on(wall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert swept(wall, tmp_path / "whole", "--level", "1", "-q") == 0
+    calls: list[int] = []
+    usual = sweep_pipeline.sweep_view
+
+    def sweep_view(scene: DenseScene, view: int, pool: Executor | None = None) -> SweptDepth:
+        calls.append(view)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return usual(scene, view, pool)
+
+    monkeypatch.setattr(sweep_pipeline, "sweep_view", sweep_view)
+    out = tmp_path / "stopped"
+    with contextlib.suppress(KeyboardInterrupt):
+        assert swept(wall, out, "--level", "1", "-q") != 0
+    assert len(calls) == 3
+    assert swept(wall, out, "--level", "1", "-q") == 0
+    # two of four were there
+    assert len(calls) == 5
+    for path in (tmp_path / "whole" / "maps").iterdir():
+        assert path.read_bytes() == (out / "maps" / path.name).read_bytes()
+
+
+def test_page_and_occupancy(wall: Path, tmp_path: Path) -> None:
+    assert swept(wall, tmp_path / "out", "--level", "1", "--occupancy", "24", "-q") == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("<img") >= 4 * 3
+    assert "view_0.png" in page
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    check_schema("sweep", report)
+    with np.load(tmp_path / "out" / "occupancy.npz") as volume:
+        assert list(volume["votes"].shape[::-1]) == report["occupancy"]["cells"]
+        assert volume["is_feature"].sum() == report["occupancy"]["num_features"]
+        assert (volume["votes"][volume["is_feature"]] >= 3).all()
+    assert (tmp_path / "out" / "occupancy.ply").is_file()
+    assert swept(wall, tmp_path / "few", "--occupancy", "2", "-q") == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from sfmapp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from sfmapp.pipelines.sweep import SweepResult
+    from sfmapp.pipelines.sweep.run import SweepResult
 
 EXAMPLES = """\
 examples:
@@ -28,11 +29,13 @@ SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model with the folder o
   DIR/maps/NAME.depth.npy       (H, W) float32, along the axis of the undistorted photograph, units of the world; NaN
                                 where it is not known
   DIR/maps/NAME.sigma.npy       how far off it may be: 68 per cent of the depths are off by less
-  DIR/maps/NAME.half_width_95.npy  the same of 95 per cent
+  DIR/maps/NAME.half_width_95.npy
+                                the same of 95 per cent
   DIR/maps/NAME.confidence.npy  share of such depths that are off by less than a plane, 0 to 1
   DIR/maps/NAME.depth.png       to look at: near is red
   DIR/maps/views.json           size, calibration and pose of each map
-  DIR/report.json
+  DIR/report.html, report.json  the page, with pictures of the maps
+  DIR/occupancy.npz, .ply       with --occupancy: votes of the photographs' edges, and the cells that hold a feature
 A depth is kept where the map of at least one other photograph confirms it, and no more of them see through it."""
 
 
@@ -50,6 +53,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--level", metavar="N", help="halve the photographs N times; default: to 1600 px or less a side"
     )
+    parser.add_argument(
+        "--occupancy", metavar="CELLS", type=int,
+        help="a volume of so many cells on its longest side as well, and which of them hold edges of the photographs",
+    )  # fmt: skip
     parser.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_sweep)
@@ -59,12 +66,14 @@ def _sweep(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"threads": args.threads, "images.mask_path": args.mask_path, "dense.level": args.level})
     load_numba_without_blas()
-    from sfmapp.pipelines.sweep import sweep
+    from sfmapp.pipelines.sweep.run import sweep
     from sfmapp.workspace.usage import Stopwatch
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
-        result = sweep(args.source, args.output, options, images=args.images, events=events, watch=watch)
+        result = sweep(
+            args.source, args.output, options, images=args.images, occupancy=args.occupancy, events=events, watch=watch
+        )
     tell_result(args, result, lambda: _print(result))
     return 0
 
@@ -79,4 +88,8 @@ def _print(result: SweepResult) -> None:
         f"{confirmed[0]:.1%}), sigma {sigmas[len(sigmas) // 2]:.2%} of the depth"
     )
     print(took(result.output, result.report.run))
+    volume = result.report.occupancy
+    if volume is not None:
+        print(f"{volume.num_features} of {math.prod(volume.cells)} cells hold a feature")
     print(f"maps {result.output / 'maps'}")
+    print(f"page {result.output / 'report.html'}")

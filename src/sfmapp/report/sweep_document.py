@@ -29,10 +29,24 @@ class SweptView(Report):
     median_sigma: float | None
 
 
+class OccupancyReport(Report):
+    """The volume of ``--occupancy``.
+
+    Attributes:
+        cells: along x, y and z. cell: side of one, units of the world.
+        num_features: cells that hold one.
+    """
+
+    cells: Sequence[int]
+    cell: float
+    num_features: int
+
+
 class SweepReport(Report):
     """The report of ``sfmapp sweep``.
 
     Attributes:
+        occupancy: of the feature-occupancy volume; None where none was asked for.
         views: what was planned. maps: those that were made. left_out: photographs without one, and why.
         usage: of each step.
     """
@@ -40,6 +54,7 @@ class SweepReport(Report):
     run: RunFacts
     views: ViewsReport
     maps: Sequence[SweptView]
+    occupancy: OccupancyReport | None
     left_out: Sequence[NamedReason]
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]

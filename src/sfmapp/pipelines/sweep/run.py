@@ -1,13 +1,14 @@
 """A model and its photographs to a depth map of each, by sweeping planes; maps of several views confirm each other.
 
 Photographs are read when their turn comes, and maps wait in files until their neighbours are there, so that memory does
-not grow with the number of photographs.
+not grow with the number of photographs, and a call that was stopped goes on from there.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,22 +16,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.plane_sweep import NEIGHBORS, SweptDepth, sweep_view
+from sfmapp.carve.plane_sweep import NEIGHBORS, Planes, SweptDepth, sweep_view
 from sfmapp.carve.sweep_agreement import confirm
 from sfmapp.dense.maps import depth_picture, write_cameras, write_picture
 from sfmapp.dense.photographs import find_photographs
-from sfmapp.dense.prepare import DensePlan, load_scene, plan_views
+from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene, plan_views
 from sfmapp.dense.report import ViewsReport
 from sfmapp.dense.scene import DenseView
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import write_array
 from sfmapp.formats.colmap import read_model
-from sfmapp.pipelines.dense.source import DenseSource, find_source
+from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
+from sfmapp.pipelines.sweep.occupancy import write_occupancy
+from sfmapp.report.stereo_pictures import SHOWN_PX
 from sfmapp.report.sweep_document import SweepReport, SweptView
+from sfmapp.report.sweep_html import MOST_SHOWN, SweptPicture, sweep_page
 from sfmapp.reporting import NamedReason
 from sfmapp.workspace.job import Job
-from sfmapp.workspace.layout import REPORT, SWEEP
+from sfmapp.workspace.keys import input_key, stage_key
+from sfmapp.workspace.layout import PAGE, REPORT, SWEEP
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
 
@@ -79,6 +84,7 @@ def sweep(
     options: Options | None = None,
     *,
     images: str | os.PathLike[str] | None = None,
+    occupancy: int | None = None,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> SweepResult:
@@ -93,6 +99,8 @@ def sweep(
         output: a new folder, an empty one, or that of an earlier call.
         options: ``dense.level`` and ``dense.ground_sampling`` for the size of the maps, masks, and ``threads``.
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
+        occupancy: write a feature-occupancy volume with so many cells on its longest side, see
+            :func:`sfmapp.pipelines.sweep.occupancy.write_occupancy`; None: none.
         events: progress, warnings and cancellation.
         watch: started when the run began.
 
@@ -107,18 +115,25 @@ def sweep(
         with job.stage("views"):
             views = _plan(job, where)
         job.note_inputs({})
-        try:
-            with job.stage(STAGE):
-                _sweep_all(job)
-            with job.stage("agreement"):
-                maps = _confirm_all(job)
-        finally:
+        key = _key(job, where)
+        if not job.workspace.has_key(STAGE, key):
             shutil.rmtree(job.workspace.folder / _UNCONFIRMED, ignore_errors=True)
+        with job.stage(STAGE, key):
+            _sweep_all(job)
+        with job.stage("agreement"):
+            maps = _confirm_all(job)
+        shutil.rmtree(job.workspace.folder / _UNCONFIRMED, ignore_errors=True)
         write_cameras(job.workspace.folder / MAPS / "views.json", job.plan)
+        volume = None
+        if occupancy is not None:
+            with job.stage("occupancy"):
+                volume = write_occupancy(job.plan, occupancy, job.workspace.folder, job.events)
         report = SweepReport(
-            run=job.facts(), views=views, maps=maps, left_out=job.left_out, usage=job.usage, warnings=job.log.warnings
-        )
+            run=job.facts(), views=views, maps=maps, occupancy=volume, left_out=job.left_out, usage=job.usage,
+            warnings=job.log.warnings,
+        )  # fmt: skip
         job.workspace.write_json(REPORT, report)
+        job.workspace.write_text(PAGE, sweep_page(report, _pictures(job, maps)))
         job.workspace.save()
         if not any(each.confirmed > 0.0 for each in maps):
             raise NoReconstructionError(
@@ -126,6 +141,24 @@ def sweep(
                 "check that the cameras are those of the photographs, and that neighbours show the same thing",
             )
         return SweepResult(job.workspace.folder, report)
+
+
+def _pictures(job: _Job, maps: list[SweptView]) -> list[SweptPicture]:
+    """Of some maps, evenly spread, what the page shows."""
+    plan, folder = coarser_plan(job.plan, SHOWN_PX), job.workspace.folder / MAPS
+    pictures = []
+    for place in np.unique(np.linspace(0, len(maps) - 1, min(len(maps), MOST_SHOWN)).round().astype(int)):
+        view = plan.names.index(maps[place].name)
+        rgb = load_scene(plan, np.array([view]), threads=job.threads).views[0].rgb
+        depth, sigma = (np.load(folder / f"{maps[place].name}.{what}.npy") for what in ("depth", "sigma"))
+        pictures.append(SweptPicture(int(place), rgb, depth, sigma))
+    return pictures
+
+
+def _key(job: _Job, where: DenseSource) -> str:
+    """Of what maps follow from: those that an earlier call left behind under it can be used."""
+    inputs = [[record.name, record.turn, input_key(record)] for record in job.plan.records]
+    return stage_key((__name__,), job.options.dense, model_digest(where.model), inputs)
 
 
 def _plan(job: _Job, where: DenseSource) -> ViewsReport:
@@ -149,26 +182,48 @@ def _sweep_all(job: _Job) -> None:
     with ThreadPoolExecutor(1) as pool:
         for view in range(len(plan.records)):
             events.raise_if_cancelled()
-            wanted = np.unique([view, *_others(plan, view)])
-            # what is read quietly is a part of this step
-            scene = load_scene(plan, wanted, threads=job.threads)
             try:
-                found = sweep_view(scene, int(np.searchsorted(wanted, view)), pool if job.threads > 1 else None)
+                job.swept.append(_earlier(job, view) or _sweep_one(job, view, pool if job.threads > 1 else None))
             except NoReconstructionError as failure:
                 job.left_out.append(NamedReason(name=plan.names[view], reason=str(failure)))
                 job.swept.append(None)
-                continue
             finally:
                 events.advanced(STAGE)
-            arrays = found.depth, found.sigma, found.half_width_95, found.confidence
-            for what, values in zip(_ARRAYS, arrays, strict=True):
-                write_array(job.waiting(view, what), values)
-            nothing = np.empty((0, 0), np.float32)
-            names = tuple(int(wanted[m]) for m in found.neighbors)
-            job.swept.append(SweptDepth(nothing, nothing, nothing, nothing, nothing, found.planes, names))
     events.finished(STAGE, f"{len(plan.records) - len(job.left_out)} maps")
     if job.left_out:
         events.warned(STAGE, f"{len(job.left_out)} photographs have no map: {job.left_out[0].reason}")
+
+
+def _sweep_one(job: _Job, view: int, pool: ThreadPoolExecutor | None) -> SweptDepth:
+    """The map of a view, left in files: arrays first, and what says that they are whole last."""
+    wanted = np.unique([view, *_others(job.plan, view)])
+    # what is read quietly is a part of this step
+    scene = load_scene(job.plan, wanted, threads=job.threads)
+    found = sweep_view(scene, int(np.searchsorted(wanted, view)), pool)
+    arrays = found.depth, found.sigma, found.half_width_95, found.confidence
+    for what, values in zip(_ARRAYS, arrays, strict=True):
+        write_array(job.waiting(view, what), values)
+    names = [int(wanted[m]) for m in found.neighbors]
+    facts = {"first": found.planes.first, "step": found.planes.step, "count": found.planes.count, "neighbors": names}
+    job.workspace.write_json(_facts(view), facts)
+    return _without_arrays(found.planes, names)
+
+
+def _earlier(job: _Job, view: int) -> SweptDepth | None:
+    """The map that an earlier call left when it was stopped; None if there is none."""
+    facts = job.workspace.read_json(_facts(view))
+    if facts is None or not all(job.waiting(view, what).is_file() for what in _ARRAYS):
+        return None
+    return _without_arrays(Planes(facts["first"], facts["step"], facts["count"]), facts["neighbors"])
+
+
+def _facts(view: int) -> str:
+    return f"{_UNCONFIRMED}/{view}.json"
+
+
+def _without_arrays(planes: Planes, neighbors: Sequence[int]) -> SweptDepth:
+    nothing = np.empty((0, 0), np.float32)
+    return SweptDepth(nothing, nothing, nothing, nothing, nothing, planes, tuple(neighbors))
 
 
 def _confirm_all(job: _Job) -> list[SweptView]:

@@ -1,0 +1,1 @@
+"""``sfmapp sweep``: depth maps of a model, and its feature-occupancy volume."""
