@@ -103,7 +103,8 @@ def textured(view: DenseView) -> NDArray[np.bool_]:
     return np.asarray(variance > max(LEAST_DEVIATION, NOISE_FACTOR * noise_deviation(grey)) ** 2)
 
 
-def lego() -> list[Score]:
+def lego_scene() -> tuple[DenseScene, list[Map]]:
+    """The test views first, with their depth; their neighbours are photographs of the training set."""
     tests, depths = lego_views("test_cameras.json", 0.5)
     photographs, _ = lego_views("cameras.json", 1.0)
     views = (*tests, *photographs)
@@ -112,11 +113,15 @@ def lego() -> list[Score]:
     # test views are nobody's neighbours
     rows = [[m for m in row if m >= len(tests)][:8] for row in ranked]
     neighbors = np.array([row + [-1] * (8 - len(row)) for row in rows], np.int32)
-    scene = DenseScene(tuple(views), neighbors, *NOTHING)
+    return DenseScene(tuple(views), neighbors, *NOTHING), depths
+
+
+def lego() -> list[Score]:
+    scene, depths = lego_scene()
     scores = []
     for view, depth in enumerate(depths):
-        near = [int(m) for m in neighbors[view] if m >= 0]
-        scores += scores_of(f"lego {Path(tests[view].name).stem}", scene, view, near, depth, LEGO_STEP / 2.0)
+        near = [int(m) for m in scene.neighbors[view] if m >= 0]
+        scores += scores_of(f"lego {Path(scene.views[view].name).stem}", scene, view, near, depth, LEGO_STEP / 2.0)
         print(*scores[-2:], sep="\n", flush=True)
     return scores
 

@@ -661,6 +661,16 @@ def promises(folder: Path) -> Iterator[Promise]:
     good = sum(row["right_of_all"] >= 0.9 for row in textured)
     text = "of the textured pixels of a courtyard 90 % have a depth within 1 %"
     yield Promise("plane_sweep", text, good, len(textured), date)
+    report = read(folder, "sweep_sigma")
+    rows, date = report["rows"], report["machine"]["date"][:10]
+    good = sum(60 <= row["inside_68"] <= 76 and 92 <= row["inside_95"] <= 97 for row in rows)
+    text = (
+        "intervals of 68 and 95 % of swept depths hold 60 to 76 and 92 to 97 % of the errors on scenes of exact depth"
+    )
+    yield Promise("sweep_sigma", text, good, len(rows), date)
+    rendered = [row for row in rows if not row["case"].startswith("lego")]
+    good = sum(row["right_of_all"] >= 90 for row in rendered)
+    yield Promise("sweep_sigma", "of textured pixels of rendered scenes 90 % are within 1 %", good, len(rendered), date)
     report = read(folder, "stereo_chance")
     for group, is_named, text in (
         ("true", False, "a pair that shows the same, however noisy, dark or plain, is not said to show something else"),
