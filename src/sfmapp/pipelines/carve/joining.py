@@ -17,7 +17,7 @@ from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.dense.files import read_patches
 from sfmapp.errors import InputError
-from sfmapp.pipelines.carve.outputs import JOINED, JOINING
+from sfmapp.pipelines.carve.outputs import JOINED, JOINING, earlier
 from sfmapp.pipelines.dense.results import PATCHES, file_digest
 from sfmapp.reporting import from_plain
 from sfmapp.workspace.job import Job
@@ -98,13 +98,13 @@ def join_patches(job: Job, path: Path, photographs: Photographs, octree: Octree,
     folder = job.workspace.folder
     # the octree's own key tells the photographs, their cameras and silhouettes
     key = stage_key((__name__,), None, job.workspace.manifest.stage(CARVE).key, file_digest(path))
-    if job.workspace.is_current(STAGE, key):
-        try:
-            found = read_joined(folder / JOINED), from_plain(JoinReport, job.workspace.read_json(JOINING))
-            job.events.decided(STAGE, "patches were joined by an earlier call")
-            return Joining(*found, evidence, octree)
-        except (InputError, ValueError):
-            pass  # taken away or damaged: joined again
+
+    def read() -> tuple[Joined, JoinReport]:
+        return read_joined(folder / JOINED), from_plain(JoinReport, job.workspace.read_json(JOINING))
+
+    found = earlier(job, STAGE, key, read, "patches were joined by an earlier call")
+    if found is not None:
+        return Joining(*found, evidence, octree)
     with job.stage(STAGE, key):
         joined, report = join_in_box(job, evidence, octree, box)
         write_joined(folder / JOINED, joined)

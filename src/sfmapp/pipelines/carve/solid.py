@@ -19,12 +19,12 @@ from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.space_carving import CarvingReport, carve_hull
 from sfmapp.carve.swept_sights import SightsReport
-from sfmapp.errors import InputError, NoReconstructionError
+from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines.carve.colors import join_colors
 from sfmapp.pipelines.carve.joining import Joining, Photographs, join_patches
 from sfmapp.pipelines.carve.lights import carve_by_lights
-from sfmapp.pipelines.carve.outputs import CARVING, COLORED, JOINED, OCTREE, SHADOWED
+from sfmapp.pipelines.carve.outputs import CARVING, COLORED, JOINED, OCTREE, SHADOWED, earlier
 from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.report.carve_document import ShadowsReport
 from sfmapp.reporting import from_plain
@@ -106,13 +106,13 @@ def _carve(
         (__name__,), options, [input_key(record) for record in source.records], _digest(silhouettes),
         [view.row.tolist() for view in source.views], box.low.tolist(), box.high.tolist(), box.told_by,
     )  # fmt: skip
-    if job.workspace.is_current(STAGE, key):
-        try:
-            found = read_octree(folder / OCTREE), from_plain(CarvingReport, job.workspace.read_json(CARVING))
-            job.events.decided(STAGE, "the volume was carved by an earlier call")
-            return hull, *found
-        except (InputError, ValueError):
-            pass  # taken away or damaged: carved again
+
+    def read() -> tuple[Octree, CarvingReport]:
+        return read_octree(folder / OCTREE), from_plain(CarvingReport, job.workspace.read_json(CARVING))
+
+    found = earlier(job, STAGE, key, read, "the volume was carved by an earlier call")
+    if found is not None:
+        return hull, *found
     with job.stage(STAGE, key):
         octree, report = _carved(job, source, hull, box)
         job.events.raise_if_cancelled()
