@@ -10,7 +10,7 @@ from carving_scenes import Solid, around, ball, both, box, pixel_centers, ring, 
 from sfmapp.camera.camera import pixels_to_rays
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
-from sfmapp.carve.joined import Evidence, Joined, JoinOptions, JoinReport, join
+from sfmapp.carve.joined import Evidence, Joined, JoinOptions, JoinReport, cast_votes, join
 from sfmapp.carve.joined_kernels import BINS, FULL, find_value, paint
 from sfmapp.carve.limits import CLOSURE, OUTLINES, PATCHES, find_known, find_limits
 from sfmapp.carve.octree import places_of
@@ -243,6 +243,27 @@ def test_the_step_towards_votes_is_the_least_of_its_energy() -> None:
     best = grid[np.argmin(energy, axis=0)]
     assert np.abs(value - np.where(fixed, start, best)).max() < 1e-3
     assert (before == start).all()
+
+
+@pytest.mark.parametrize("back", [1.0, 2.0])
+def test_a_sight_tells_nothing_farther_behind_a_patch_than_was_said(back: float) -> None:
+    toward = np.zeros((4, 4, 3), np.float32)
+    toward[..., 2] = -1.0
+    sight = Sight(
+        np.array([4.0, 4.0, 2.0, 2.0]),
+        np.array([*rigid3.quaternion(np.eye(3)), 0.0, 0.0, 0.0]),
+        np.ones((4, 4), np.float32),
+        toward,
+        0.25,
+    )
+    # depths in bands behind the patch: in front of the band, in it, and behind it
+    behind = np.array([-2.0, -0.5, 0.5, 0.99, 1.5, 1.99, 2.01, 5.0])
+    votes = np.zeros((len(behind), BINS), np.uint8)
+    cast_votes(np.stack([0 * behind, 0 * behind, 1.0 + 0.1 * behind], axis=1), [sight], 0.1, back, votes)
+    assert (votes.sum(axis=1) == (behind < back)).all()
+    assert (votes[behind >= 1.0, : BINS - 1] == 0).all()
+    assert votes[0, 0] == 1
+    assert votes[1, 1:].argmax() < votes[2, 1:].argmax() < votes[3, 1:].argmax()
 
 
 def test_sights_of_patches_show_the_surface() -> None:

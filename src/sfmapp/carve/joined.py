@@ -63,7 +63,7 @@ _FILL_VOTES = 4.0
 # a photograph sees a surface that is turned this much towards it
 _LEAST_COSINE = 0.1
 _CHUNK = 1 << 15
-_RANGES = {"trust": positive(100.0), "keep": Range(0.0, 100.0)}
+_RANGES = {"trust": positive(100.0), "keep": Range(0.0, 100.0), "back": Range(1.0, 100.0)}
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,14 @@ class JoinOptions:
         trust: how much surface a sight of the band's width is worth; less is smoother and closes more.
         keep: the hull counts as so many sights where a photograph sees it. With 0 the least surface closes what nothing
             tells; the more it is, the more of the hull stays there.
+        back: behind what a sight sees it is full for so many bands. With 1 nothing is said beyond the band in which the
+            surface lies: how thick a part is, no sight tells, and the back of a thin one that nobody sees would come
+            out too far away.
     """
 
     trust: float = 1.5
     keep: float = 0.0
+    back: float = 1.0
 
     def __post_init__(self) -> None:
         check_options(STAGE, self, _RANGES)
@@ -230,7 +234,7 @@ def join(
             level = _begin(number, levels[-1] if levels else None, cube, evidence.hull, pool)
             cell = side / 2.0**number
             width = max(band, _BAND_CELLS * cell)
-            level.votes = _votes(level.xyz, sights, width, pool)
+            level.votes = _votes(level.xyz, sights, width, options.back, pool)
             _hold_outside(level, width)
             if options.keep > 0.0:
                 _keep(level, evidence, options.keep, cell, pool)
@@ -311,15 +315,17 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
     return level
 
 
-def cast_votes(xyz: Array, sights: Sequence[Sight], band: float, votes: NDArray[np.uint8]) -> None:
+def cast_votes(xyz: Array, sights: Sequence[Sight], band: float, back: float, votes: NDArray[np.uint8]) -> None:
     """Add what each sight says of points (N, 3) to their votes (N, BINS), see :func:`~.joined_kernels.vote`."""
     for sight in sights:
-        vote(xyz, rigid3.to_matrix(sight.cam_from_world), sight.k, sight.depth, sight.normal, band, votes)
+        vote(xyz, rigid3.to_matrix(sight.cam_from_world), sight.k, sight.depth, sight.normal, band, back, votes)
 
 
-def _votes(xyz: Array, sights: Sequence[Sight], band: float, pool: ThreadPoolExecutor) -> NDArray[np.uint8]:
+def _votes(
+    xyz: Array, sights: Sequence[Sight], band: float, back: float, pool: ThreadPoolExecutor
+) -> NDArray[np.uint8]:  # fmt: skip
     votes = np.zeros((len(xyz), BINS), np.uint8)
-    _in_parts(lambda first, last: cast_votes(xyz[first:last], sights, band, votes[first:last]), len(xyz), pool)
+    _in_parts(lambda first, last: cast_votes(xyz[first:last], sights, band, back, votes[first:last]), len(xyz), pool)
     return votes
 
 

@@ -19,8 +19,6 @@ Floats = NDArray[np.float32]
 # Votes of a node by how far inside it is: the first is for free space, the last for what lies well behind a patch,
 # those between are for distances from -1 to 1 of the band.
 BINS = 10
-# behind a patch it is full for so many widths of the band, and beyond that nobody knows
-_BACK = 2.0
 # A patch seen at a slant is trusted as a plane this far along the ray, in widths of the band: beyond, a place in front
 # of it is free however near it is to the plane, and one behind it is unknown.
 _ALONG = 6.0
@@ -30,11 +28,13 @@ EMPTY, FULL = -1, -2
 
 @numba.njit(cache=True, nogil=True)
 def vote(
-    xyz: Array, outer: Array, k: Array, depth: Floats, normal: Floats, band: float, votes: NDArray[np.uint8]
-) -> None:
+    xyz: Array, outer: Array, k: Array, depth: Floats, normal: Floats, band: float, back: float,
+    votes: NDArray[np.uint8],
+) -> None:  # fmt: skip
     """Add what one sight says of places (N, 3) to their votes (N, BINS).
 
-    ``outer`` (3, 4) is from the world into the camera, ``k`` (4,) its pinhole, ``band`` in units of the world.
+    ``outer`` (3, 4) is from the world into the camera, ``k`` (4,) its pinhole, ``band`` in units of the world. Behind a
+    patch it is full for ``back`` widths of the band, and beyond nobody knows.
     """
     height, width = depth.shape
     for i in range(xyz.shape[0]):
@@ -58,7 +58,7 @@ def vote(
             at = 0
         elif share < 1.0:
             at = 1 + int(0.5 * (share + 1.0) * (BINS - 2))
-        elif share < _BACK:
+        elif share < back:
             at = BINS - 1
         else:
             continue

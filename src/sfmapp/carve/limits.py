@@ -147,7 +147,7 @@ def find_known(
 def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[np.bool_]:
     """Which places (F, 3) lie within a band of a patch that a photograph sees there."""
     votes = np.zeros((len(centers), BINS), np.uint8)
-    cast_votes(centers, evidence.sights, band, votes)
+    cast_votes(centers, evidence.sights, band, 1.0, votes)
     return np.asarray((votes[:, 1 : BINS - 1] > 0).any(axis=1))
 
 

@@ -20,7 +20,8 @@ _PIXEL_BYTES = 36.0
 _PIXELS_A_CELL = 2.0
 # Depths of plain surfaces are not told, and the least surface there cuts off what is the object's: it looked worse than
 # the hull. Against the hull, which counts as one sight where photographs see it, it takes two that agree.
-JOIN = JoinOptions(keep=1.0)
+# They are seldom many, and more is said behind them than behind patches.
+JOIN = JoinOptions(keep=1.0, back=2.0)
 
 
 def join_colors(
