@@ -46,9 +46,9 @@ DENSITIES = {"24x4": (24, 4), "72x8": (72, 8), "16x4": (16, 4)}
 # scene, density, seed of the noise, finest cells along the side of the cube, width of the photographs
 ROWS = (
     ("house", "16x4", 0, 128, 400), ("drawn 2", "16x4", 0, 128, 400), ("jug", "16x4", 0, 128, 400),
-    ("drawn 1", "16x4", 0, 128, 400), ("house", "72x8", 0, 128, 400), ("house", "24x4", 0, 128, 400),
-    ("house", "16x4", 0, 256, 800), ("jug", "24x4", 0, 128, 400), ("drawn 2", "72x8", 0, 128, 400),
-    ("house", "16x4", 1, 128, 400),
+    ("drawn 1", "16x4", 0, 128, 400), ("house", "24x4", 0, 128, 400), ("house", "72x8", 0, 64, 200),
+    ("house", "72x8", 0, 128, 400), ("house", "16x4", 0, 256, 800), ("jug", "24x4", 0, 128, 400),
+    ("drawn 2", "72x8", 0, 128, 400), ("house", "16x4", 1, 128, 400),
 )  # fmt: skip
 NOISE_GREY = 2.0
 POINTS = 100_000
@@ -231,12 +231,17 @@ def picture(path: Path) -> None:
     view, first, before, after = scene.views[at], scene.pictures[at], grid_of(hull), grid_of(carved)
     photos = [photograph(first.light[k], NOISE_GREY, [0, at, k]) for k in (0, 1)]
     photos.append(np.where(shadows[at * 4].dark, 255, photos[1] // 2).astype(np.uint8))
-    axis = ((np.arange(300) + 0.5) / 150 - 1.0) * half_side(scene.solid)
-    x, y = np.meshgrid(axis, -axis)
-    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.1)], axis=1)
+    rows, columns = np.nonzero(first.cover)
+    part = slice(rows.min() - 15, rows.max() + 16), slice(columns.min() - 15, columns.max() + 16)
+    photos = [photo[part] for photo in photos]
+    height, width = photos[0].shape
+    pixel = 2.0 * half_side(scene.solid) / width
+    x, y = np.meshgrid(*(pixel * (np.arange(n) + 0.5 - 0.5 * n) for n in (width, height)))
+    xyz = np.stack([x.ravel(), -y.ravel(), np.full(x.size, 0.1)], axis=1)
     grey = 255 - 60 * before.holds(xyz) - 60 * after.holds(xyz) - 75 * (scene.solid.distance(xyz) < 0.0)
-    piece = np.pad(grey.reshape(300, 300).astype(np.uint8), ((0, 0), (50, 50)), constant_values=255)
-    both = np.vstack([np.hstack(photos), np.hstack([shaded(before, view), shaded(after, view), piece])])
+    piece = grey.astype(np.uint8)
+    lower = [shaded(before, view)[part], shaded(after, view)[part], piece.reshape(height, width)]
+    both = cv2.resize(np.vstack([np.hstack(photos), np.hstack(lower)]), None, fx=1.5, fy=1.5)
     cv2.imwrite(str(path), both, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
