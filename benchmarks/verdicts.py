@@ -595,16 +595,20 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "poses given out live drift less with an IMU than without"
     yield Promise("inertial", text, sum(b < a for a, b in live), len(live), report["date"][:10])
     report = read(folder, "wheeled")
-    pairs = [(run["free"], run["planar"]) for run in report["runs"]]
+    pairs = [(run["free"], run[motion]) for run in report["runs"] for motion in ("planar", "ackermann")]
     text = "on wheels planar motion gives no fewer frames a pose than free motion"
     kept = [planar["num_frames"] >= free["num_frames"] for free, planar in pairs]
     yield Promise("wheeled", text, sum(kept), len(kept), report["date"][:10])
+    short = [(free, planar) for free, planar in pairs if free["num_frames"] < report["num_frames"]]
+    text = "where free motion leaves frames without a pose, planar motion gives more of them one"
+    more = [planar["num_frames"] > free["num_frames"] for free, planar in short]
+    yield Promise("wheeled", text, sum(more), len(more), report["date"][:10])
     posed = [pair for pair in pairs if all("ate_m" in row for row in pair)]
     text = "on wheels planar motion has half the error of free motion"
     halved = [planar["ate_m"] <= 0.5 * free["ate_m"] for free, planar in posed]
     yield Promise("wheeled", text, sum(halved), len(halved), report["date"][:10])
     text = "on wheels, ramps and leaning cars among them, planar motion has a NEES below 2"
-    honest = [planar["nees"] < 2.0 for _, planar in posed if planar["nees"] is not None]
+    honest = [planar["nees"] < 2.0 for _, planar in pairs if planar.get("nees") is not None]
     yield Promise("wheeled", text, sum(honest), len(honest), report["date"][:10])
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]

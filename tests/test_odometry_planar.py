@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -11,15 +12,18 @@ from gtsam.symbol_shorthand import G, X
 
 import odometry_sequences as played
 from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import project, simple_camera
 from sfmapp.camera.names import CameraModel
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.initialize import MapInitializer, _is_on_wheels
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.refinement.motion_plane import fit_motion_plane, shared_factor
-from sfmapp.odometry.refinement.planar_adjustment import PlaneFactor
+from sfmapp.odometry.refinement.planar_adjustment import PlaneFactor, hold_to_plane
+from sfmapp.odometry.report import PlaneEvidence
 from sfmapp.scene.rig import Rig
 
 CAMERA = simple_camera(CameraModel.PINHOLE, 640, 480, 525.0)
@@ -109,6 +113,16 @@ def test_a_hand_is_no_vehicle_and_a_straight_way_tells_no_plane() -> None:
     assert plane.up_in_cam == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)  # as cameras on wheels are mounted
 
 
+def test_a_straight_way_holds_no_map() -> None:
+    model, _ = seen_map(0, "level")[0].reconstruction(np.arange(NUM))
+    model.cam_from_world = np.tile(rigid3.IDENTITY, (NUM, 1))
+    model.cam_from_world[:, 6] = -np.arange(float(NUM))
+    found = hold_to_plane(model, AdjustOptions(), 0.3, 1)
+    assert isinstance(found, PlaneEvidence)
+    assert found.state == "dropped"
+    assert found.reason == "turns of 0 degrees tell no plane, 30 are asked for"
+
+
 def test_deviations_that_hang_together_count_as_one() -> None:
     rng = np.random.default_rng(2)
     independent = rng.normal(size=(400, 20))
@@ -195,3 +209,57 @@ def test_a_leaning_car_is_not_held_upright() -> None:
         assert final.covariance is not None
         scores.append(played.normalized_errors(errors, final.covariance).mean())
     assert 0.4 < np.mean(scores) < 2.0
+
+
+def followed(seed: int, share: float, num_frames: int = 7) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Corners that a level camera going ahead has followed, a share of them on pieces that move on their own, the true
+    pose of the last view from the first, and which are wrong."""
+    rng = np.random.default_rng([seed, 0xF0])
+    num = 300
+    corners = rng.uniform(0.0, 1.0, (num, 2)) * [CAMERA.width, CAMERA.height]
+    rays = np.column_stack([(corners - [320.0, 240.0]) / CAMERA.focal, np.ones(num)])
+    xyz, is_wrong = rays * rng.uniform(4.0, 25.0, (num, 1)), rng.random(num) < share
+    speed, seen, pose = rng.normal(0.0, 4.0, (num, 2)), [], rigid3.IDENTITY
+    for k in range(num_frames):
+        way = rigid3.exp_so3([0.0, 0.004 * k, 0.0]) @ [0.0, 0.0, 1.0]
+        pose = rigid3.from_matrix(rigid3.exp_so3([0.001 * k, 0.008 * k, 0.0]), -0.25 * k * way)
+        right = project(CAMERA, rigid3.apply(pose, xyz))
+        xy = np.where(is_wrong[:, None], corners + k * speed, right) + rng.normal(0.0, 0.15, (num, 2))
+        inside = (xy > 0.0).all(1) & (xy < [CAMERA.width, CAMERA.height]).all(1)
+        seen.append(np.where(inside[:, None], xy, np.nan))
+    return seen, pose, is_wrong
+
+
+@pytest.mark.parametrize("motion", ["planar", "ackermann"])
+def test_a_map_on_wheels_begins_among_wrong_corners_and_begins_right(motion: Literal["planar", "ackermann"]) -> None:
+    begun = 0
+    for seed in range(4):
+        seen, pose, is_wrong = followed(seed, 0.65)
+        free, wheeled = (
+            MapInitializer(CAMERA, OdometryOptions(motion=way), 0, corners=seen[0], seen=seen)._two_views(
+                np.flatnonzero(np.isfinite(seen[-1][:, 0]))
+            )
+            for way in ("free", motion)
+        )
+        assert free is None
+        if wheeled is not None:
+            begun += 1
+            centers = [rigid3.center(p) for p in (wheeled.last_from_first, pose)]
+            cosine = centers[0] @ centers[1] / np.linalg.norm(centers[0]) / np.linalg.norm(centers[1])
+            assert np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) < 5.0
+            assert is_wrong[wheeled.track].mean() < 0.2
+    assert begun >= 3
+
+
+def test_what_a_vehicle_cannot_do_is_told() -> None:
+    for yaw in (-0.4, 0.0, 0.3):
+        turn = rigid3.exp_so3([0.01, yaw, -0.01])
+        for side, is_car_like in ((-0.5 * yaw, True), (-yaw, True), (0.7, False), (-0.7 - abs(yaw), False)):
+            for sign in (1.0, -1.0):
+                pose = rigid3.from_matrix(turn, -sign * turn @ [np.sin(side), 0.05, np.cos(side)])
+                assert _is_on_wheels(pose, is_car=False)
+                assert _is_on_wheels(pose, is_car=True) == is_car_like
+    rising = rigid3.from_matrix(np.eye(3), np.array([0.0, -0.4, 1.0]))
+    rolling = rigid3.from_matrix(rigid3.exp_so3([0.0, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]))
+    assert not _is_on_wheels(rising, is_car=False)
+    assert not _is_on_wheels(rolling, is_car=False)

@@ -11,6 +11,7 @@ from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import epipolar, homography, rigid3
 from sfmapp.geometry.planar_motion import NumPoints, estimate_planar_motion
+from sfmapp.geometry.relative_pose import refine_on_inliers
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac
 from sfmapp.matching.two_view import TwoViewGeometry, verify_front
@@ -30,6 +31,14 @@ _MIN_LEFT = 0.4
 # Before that, where fewer are left than this, parallax is as large as it gets: the best of several motions will do if
 # the next is worse by this factor.
 _LATE, _LATE_RIVAL_SHARE = 0.5, 1.15
+# Share of the corners that have to agree; and on wheels, where two angles tell which do, if so many of these are where
+# they should be in the views between as well.
+_MIN_AGREEING, _MIN_AGREEING_ON_WHEELS, _MIN_AGREEING_BETWEEN = 0.5, 0.15, 0.7
+# Nod and roll on springs, in which a planar motion that is looked for has no say, move points by so many times the
+# limit; inliers are then found by a motion without a plane.
+_SPRINGS = 2.5
+# A robot's camera looks level to this, and nods and rolls by less than that from one view to another.
+_LEVEL_RAD, _NOD_RAD = float(np.radians(10.0)), float(np.radians(2.0))
 # Displacement, as a share of the image width, below which two views are not even looked at.
 _MIN_FLOW = 0.01
 # Fewest points of a first map; half of what pose refinement and the keyframe rules are comfortable with.
@@ -153,7 +162,8 @@ class MapInitializer:
             self.reason = f"the two views look like {found.config.name}"
             self.is_turn = found.config in (TwoViewConfig.PANORAMIC, TwoViewConfig.PLANAR_OR_PANORAMIC)
             return None
-        if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, 0.5 * len(track)):
+        least = _MIN_AGREEING if self.options.motion == "free" else _MIN_AGREEING_ON_WHEELS
+        if found.median_angle_deg < _MIN_MEDIAN_ANGLE_DEG or num < max(_MIN_POINTS, least * len(track)):
             self.reason = f"{num} of {len(track)} corners agree, {found.median_angle_deg:.2f} deg of parallax"
             return None
         # a plane tells which corners agree; how the camera nodded and rolled in it they tell by themselves
@@ -168,7 +178,12 @@ class MapInitializer:
             self.reason = f"{int(good.sum())} points with depth"
             return None
         shown = np.column_stack([xn1, np.ones(len(xn1))]) * depths[:, :1]
-        if not self._is_confirmed(pose, track[found.is_inlier][good], shown[good]):
+        with_depth = int(good.sum())
+        if num < _MIN_AGREEING * len(track):
+            good[good] = self._agree_between(pose, track[found.is_inlier][good], shown[good], limit)
+        if good.sum() < max(_MIN_POINTS, _MIN_AGREEING_BETWEEN * with_depth) or not self._is_confirmed(
+            pose, track[found.is_inlier][good], shown[good]
+        ):
             self.reason = "the frames in between do not show the same depths"
             return None
         unit = 1.0 / float(np.median(depths[good, 0]))
@@ -187,6 +202,13 @@ class MapInitializer:
         """The relative pose of the first and the last view, None if others explain them and those between as well."""
         xy1, xy2 = self.corners[track], self.seen[-1][track]
         poses, costs = explaining_poses(self.camera, xy1, xy2, given, limit_px)
+        if len(track) < _MIN_AGREEING * int(np.isfinite(self.seen[-1][:, 0]).sum()):
+            # wrong matches make rivals, most of which no vehicle can do
+            is_car = self.options.motion == "ackermann"
+            on_wheels = [k for k, pose in enumerate(poses) if _is_on_wheels(pose, is_car=is_car)]
+            poses, costs = [poses[k] for k in on_wheels], costs[on_wheels]
+        if not poses:
+            return None
         own = costs.copy()
         if len(poses) > 1:
             for n in self._witnesses(track):
@@ -243,20 +265,47 @@ class MapInitializer:
             turned += _left_by_turn(camera, first_xy[known], xy[known]) ** 2
         return left < _MAX_LEFT_SHARE**2 * turned
 
+    def _agree_between(self, last_from_first: Array, track: NDArray[np.int64], xyz: Array, limit_px: float) -> Mask:
+        """(N,) which points are within a limit of where they should be in every view between that is asked."""
+        agree = np.ones(len(track), bool)
+        for n in self._witnesses(track):
+            xy = self.seen[n][track]
+            known = np.isfinite(xy[:, 0])
+            if known.sum() >= _MIN_POINTS:
+                error = self._errors_between(last_from_first, n, xyz[known], xy[known])
+                agree[known] &= error < limit_px  # False behind a camera
+        return agree
+
     def _hold_to_plane(self, found: TwoViewGeometry, xy1: Array, xy2: Array, limit_px: float) -> None:
-        """Put a wheeled robot's motion in the place of a free one where that explains fewer corners: two unknowns bear
-        more outliers than five, but springs and a camera that does not look level have no place in them."""
+        """Put a motion that begins with a wheeled robot's in the place of one where that explains fewer corners: two
+        unknowns bear more outliers than five; springs and a camera that does not look level come after."""
         xn1, xn2 = (pixels_to_normalized(self.camera, xy) for xy in (xy1, xy2))
         num_points: NumPoints = 1 if self.options.motion == "ackermann" else 2
-        planar = estimate_planar_motion(
-            xn1, xn2, limit_px / self.camera.focal, seed=self.seed, num_points=num_points
-        )  # fmt: skip
-        if planar is None or planar[1].sum() <= found.is_inlier.sum():
+        limit = limit_px / self.camera.focal
+        planar = estimate_planar_motion(xn1, xn2, _SPRINGS * limit, seed=self.seed, num_points=num_points)
+        if planar is None:
             return
-        found.cam2_from_cam1, found.is_inlier = planar
+        pose, errors = refine_on_inliers(planar[0], xn1, xn2, limit, first_gate=_SPRINGS * limit, rounds=8)
+        is_inlier = errors < limit**2
+        if is_inlier.sum() <= found.is_inlier.sum():
+            return
+        found.cam2_from_cam1, found.is_inlier = pose, is_inlier
         found.config = TwoViewConfig.CALIBRATED
         _, angles = epipolar.ray_depths(found.cam2_from_cam1, xn1[found.is_inlier], xn2[found.is_inlier])
         found.median_angle_deg = float(np.degrees(np.median(angles))) if len(angles) else 0.0
+
+
+def _is_on_wheels(cam2_from_cam1: Array, *, is_car: bool) -> bool:
+    """Whether a pose is what a camera that looks about level can do on level ground; one on a car, looking ahead, goes
+    where it looks or back, along half of its turn over the rear axle and all of it far ahead of that."""
+    turn, way = rigid3.log_so3(rigid3.rotation_matrix(cam2_from_cam1)), rigid3.center(cam2_from_cam1)
+    way /= np.linalg.norm(way)
+    nod, slack = float(np.hypot(turn[0], turn[2])), float(np.sin(_LEVEL_RAD))
+    is_level = abs(way[1]) < slack and nod < _NOD_RAD + slack * abs(turn[1])
+    # cam2_from_cam1 turns against the car
+    aside = float(np.arctan2(way[0], way[2]) if way[2] > 0.0 else np.arctan2(-way[0], -way[2]))
+    low, high = sorted((0.0, -float(turn[1])))
+    return bool(is_level and (not is_car or low - _LEVEL_RAD < aside < high + _LEVEL_RAD))
 
 
 def _left_by_turn(camera: Camera, xy1: Array, xy2: Array) -> float:

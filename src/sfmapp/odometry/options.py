@@ -36,8 +36,8 @@ class OdometryOptions:
         min_triangulation_deg: smallest angle between the rays of a new point of one moving camera
         min_stereo_deg: the same for a rig, whose baseline is known; depths are then good to about 10 %
         max_lost_s: seconds without relocalization before a new map is begun
-        motion: planar for a wheeled robot on level ground: a ground plane takes part in the closing adjustment, where
-            the images agree; ackermann for a car of which the camera looks ahead, whose map may begin by one point
+        motion: planar for a wheeled robot on level ground: maps begin among more wrong corners, and a ground plane
+            takes part in the closing adjustment where the images agree; ackermann for a car whose camera looks ahead
         known_map: OUT of an earlier odometry run or reconstruction, or a COLMAP model with its photographs, that the
             sequence is localised in
         loops: recognise places seen before, close loops and join maps

@@ -23,7 +23,7 @@ _LEAST_TILT_RAD, _LEAST_HEIGHT_SHARE = 1e-5, 1e-6
 _MOUNTED_RAD = 0.35
 # What looks like a vehicle on level ground: it nods and rolls by less than this, leaves its plane by less than this
 # share of its way, and turns by more than this, as a straight way tells no plane. A hand sways by two degrees or more.
-_MAX_TILT_RAD, _MAX_HEIGHT_SHARE, _MIN_TURN_RAD = float(np.radians(1.0)), 0.02, float(np.radians(30.0))
+_MAX_TILT_RAD, _MAX_HEIGHT_SHARE, MIN_TURN_RAD = float(np.radians(1.0)), 0.02, float(np.radians(30.0))
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class MotionPlane:
         """Whether this is how a vehicle on level ground moves, and the motion tells its plane."""
         nod, roll, height = np.sqrt((self.deviations**2).mean(0))
         is_flat = max(nod, roll) < _MAX_TILT_RAD and height < _MAX_HEIGHT_SHARE * self.size
-        return bool(is_flat and self.turned_rad > _MIN_TURN_RAD)
+        return bool(is_flat and self.turned_rad > MIN_TURN_RAD)
 
 
 def fit_motion_plane(cam_from_map: Array) -> MotionPlane | None:

@@ -24,7 +24,13 @@ from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.refinement.motion_plane import MotionPlane, fit_motion_plane, shared_factor, tangents
+from sfmapp.odometry.refinement.motion_plane import (
+    MIN_TURN_RAD,
+    MotionPlane,
+    fit_motion_plane,
+    shared_factor,
+    tangents,
+)
 from sfmapp.odometry.report import PlaneEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -39,7 +45,7 @@ _MAX_STEPS, _TOLERANCE, _DAMPING = 30, 1e-6, 1e-6
 _MAX_TILT_RAD, _MAX_HEIGHT_SHARE = float(np.radians(3.0)), 0.05
 # Fewest independent deviations that variances may be learned of: with as few the estimate is good to a third.
 _MIN_INDEPENDENT = 6.0
-# Little is known of the plane beforehand, but that cameras look about level: a straight way does not tell it.
+# Little is known of the plane beforehand, but that cameras look about level.
 _OPEN_RAD = 0.35
 # The length that holds the unit of a map that has none, as a share of itself.
 _UNIT = 1e-3
@@ -80,6 +86,10 @@ def hold_to_plane(
     plane = fit_motion_plane(poses) if len(poses) >= _MIN_KEYFRAMES else None
     if plane is None:
         return PlaneEvidence(state="dropped", reason=f"{len(poses)} keyframes tell no plane of motion")
+    if plane.turned_rad < MIN_TURN_RAD:
+        # about so straight a way a normal of any roll fits: what sways aside would be taken for heights
+        turned, least_turn = np.degrees([plane.turned_rad, MIN_TURN_RAD])
+        return _unheld(plane, f"turns of {turned:.0f} degrees tell no plane, {least_turn:.0f} are asked for")
     sigmas = np.sqrt((plane.deviations**2).mean(0))
     least = np.array([1e-5, 1e-5, 1e-6 * plane.size])
     graph, found, start = None, None, model
