@@ -275,6 +275,9 @@ def markdown(report: dict[str, Any]) -> str:
         lines.append(f"{about} | {' | '.join(cells)} | {told} |")
     shares = {run["way"]: run for run in report["runs"] if run["case"] == "lego"}
     lines += ["", "Sizes are diagonals of boxes. CPU of patches is in what is made of them."]
+    for commit in dict.fromkeys(run["commit"] for run in report["runs"] if run["commit"] != report["commit"]):
+        told = dict.fromkeys(f"{run['case']} {run['way']}" for run in report["runs"] if run["commit"] == commit)
+        lines.append(f"At {commit}: {', '.join(told)}.")
     if shares:
         told = ", ".join(
             f"{way} {100 * run['judged_share']:.0f} % ({100 * run['at 0.01']['accuracy_of_all']:.1f} % within 1 %)"

@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from sfmapp.camera import lens
 from sfmapp.camera.camera import pixels_to_rays
 from sfmapp.carve.carving_kernels import STEPS, Fields, cone_slopes, hull_distances, view_distances
+from sfmapp.carve.parts import in_parts
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 # samples along the longer side of a picture from which a lens's largest slope is taken, and what is added to it for
 # slopes between the samples: a lens of which it is more changes its focal length by a tenth within a 64th of a picture
 _SAMPLES, _BETWEEN = 64, 1.1
-# points for a thread at a time: enough that starting it costs nothing, few enough that neighbours are read together
+# points for a thread at a time: few enough that neighbours are read together
 _CHUNK = 1 << 13
 
 
@@ -63,8 +64,8 @@ class Hull:
         owners = self._ask(points, threads)[1]
         out = np.empty((len(points), 3), np.float32)
 
-        def run(part: slice) -> None:
-            cone_slopes(self.fields, points[part], owners[part], step, out[part])
+        def run(a: int, b: int) -> None:
+            cone_slopes(self.fields, points[a:b], owners[a:b], step, out[a:b])
 
         _in_parts(run, len(points), threads)
         return out
@@ -74,7 +75,7 @@ class Hull:
         given, positive inside, units of the world; NaN where a view does not tell."""
         points = np.ascontiguousarray(xyz, np.float64)
         out = np.empty((len(points), len(self)), np.float32)
-        _in_parts(lambda part: view_distances(self.fields, points[part], out[part]), len(points), threads)
+        _in_parts(lambda a, b: view_distances(self.fields, points[a:b], out[a:b]), len(points), threads)
         result = np.empty_like(out)
         result[:, self.order] = out
         return result
@@ -84,18 +85,16 @@ class Hull:
         points = np.ascontiguousarray(xyz, np.float64)
         out, owners = np.empty(len(points)), np.empty(len(points), np.int32)
 
-        def run(part: slice) -> None:
-            hull_distances(self.fields, points[part], self.min_views, self.misses, out[part], owners[part])
+        def run(a: int, b: int) -> None:
+            hull_distances(self.fields, points[a:b], self.min_views, self.misses, out[a:b], owners[a:b])
 
         _in_parts(run, len(points), threads)
         return out, owners
 
 
-def _in_parts(run: Callable[[slice], None], num: int, threads: int | None) -> None:
-    """Do something with parts of so many points on all threads."""
-    parts = [slice(begin, begin + _CHUNK) for begin in range(0, num, _CHUNK)]
+def _in_parts(run: Callable[[int, int], None], num: int, threads: int | None) -> None:
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        list(pool.map(run, parts))
+        in_parts(run, num, pool, _CHUNK)
 
 
 def hull_of(

@@ -21,7 +21,7 @@ The lattice is that of an octree's corners, from coarse to fine, and at each lev
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from sfmapp.carve.hull import Hull
 from sfmapp.carve.joined_kernels import BINS, EMPTY, FULL, find_flow, find_value, mark_behind, paint, vote
 from sfmapp.carve.octree import Codes, Octree, codes_of, merged, places_of
+from sfmapp.carve.parts import in_parts
 from sfmapp.carve.sight import Sight
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
@@ -62,7 +63,6 @@ _MARGIN_PX = 1.0
 _FILL_VOTES = 4.0
 # a photograph sees a surface that is turned this much towards it
 _LEAST_COSINE = 0.1
-_CHUNK = 1 << 15
 _RANGES = {"trust": positive(100.0), "keep": Range(0.0, 100.0), "back": Range(1.0, 100.0)}
 
 
@@ -294,7 +294,7 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
     def measure(first: int, last: int) -> None:
         distance[first:last] = hull.distance(xyz[first:last], 1)
 
-    _in_parts(measure, num, pool)
+    in_parts(measure, num, pool)
     level = _Level(
         places, codes, xyz, distance, np.empty((0, BINS), np.uint8), np.zeros(num, np.float32),
         np.ones(num, np.float32), np.empty((num, 3), np.int32), np.empty((num, 3), np.int32), np.zeros(num, np.bool_),
@@ -325,7 +325,7 @@ def _votes(
     xyz: Array, sights: Sequence[Sight], band: float, back: float, pool: ThreadPoolExecutor
 ) -> NDArray[np.uint8]:  # fmt: skip
     votes = np.zeros((len(xyz), BINS), np.uint8)
-    _in_parts(lambda first, last: cast_votes(xyz[first:last], sights, band, back, votes[first:last]), len(xyz), pool)
+    in_parts(lambda first, last: cast_votes(xyz[first:last], sights, band, back, votes[first:last]), len(xyz), pool)
     return votes
 
 
@@ -358,15 +358,7 @@ def _keep(level: _Level, evidence: Evidence, keep: float, cell: float, pool: Thr
         seen = part[is_seen]
         level.extra[seen] = np.maximum(level.extra[seen], np.float32(keep))
 
-    _in_parts(run, len(idx), pool)
-
-
-def _in_parts(run: Callable[[int, int], None], num: int, pool: ThreadPoolExecutor) -> None:
-    """Call ``run(first, last)`` for parts of a range on threads."""
-    if num <= _CHUNK:
-        run(0, num)
-    else:
-        list(pool.map(lambda first: run(first, min(num, first + _CHUNK)), range(0, num, _CHUNK)))
+    in_parts(run, len(idx), pool)
 
 
 def _solve(level: _Level, weight: float, iterations: int, events: Events, pool: ThreadPoolExecutor) -> None:
@@ -376,8 +368,8 @@ def _solve(level: _Level, weight: float, iterations: int, events: Events, pool: 
     value, before, flow = level.value, level.value.copy(), np.zeros((num, 3), np.float32)
     for _ in range(iterations):
         events.raise_if_cancelled()
-        _in_parts(lambda a, b: find_flow(a, b, value, before, level.after, _STEP, flow), num, pool)
-        _in_parts(
+        in_parts(lambda a, b: find_flow(a, b, value, before, level.after, _STEP, flow), num, pool)
+        in_parts(
             lambda a, b: find_value(
                 a, b, flow, level.prior, level.votes, level.extra, is_fixed, weight, _STEP, value, before
             ),
