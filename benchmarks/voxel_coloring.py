@@ -213,8 +213,8 @@ def markdown(report: dict[str, Any]) -> str:
         "# Carving by colours", "",
         f"`benchmarks/voxel_coloring.py`; sfmapp at {report['commit']}; {report['cpu']}, {report['date']}.", "",
         "| object | drawn as | cells | way | PSNR of unused photographs, dB | over the hull | IoU of silhouettes | "
-        "volume | true cells lost | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "volume | true cells lost | CPU s | at |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for run in report["runs"]:
         hull = next(
@@ -226,7 +226,7 @@ def markdown(report: dict[str, Any]) -> str:
         lost = f"{run['lost_share']:.2%}" if "lost_share" in run else ""
         lines.append(
             f"| {run['case']} | {run['drawn']} | {run['cells']} | {run['way']} | {run['psnr']:.2f} | {gain} | {iou} | "
-            f"{volume} | {lost} | {run['cpu_s']:.0f} |"
+            f"{volume} | {lost} | {run['cpu_s']:.0f} | {run['commit']} |"
         )
     lines += ["", "Grey levels by which photographs of one place differ, by the degrees between their directions:", ""]
     for run in report["runs"]:
@@ -243,6 +243,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "voxel_coloring.json")
     args = parser.parse_args()
     runs = json.loads(args.output.read_text())["runs"] if args.output.is_file() else []
+    report: dict[str, Any] = describe_machine()
     order = ["lego", "temple", *SOLIDS, *FRESH]
     cases = {"lego": lambda: lego_case(Path(folder)), "temple": temple_case}
     names = [name for name in order if name.startswith(args.only)]
@@ -253,9 +254,9 @@ def main() -> None:
             runs = [old for old in runs if old["case"] != name]
             for measured in (surfaces(case, held, CELLS if name in cases else SOLID_CELLS), voxels(case, held)):
                 for run in measured:
-                    runs.append(run)
+                    runs.append(run | {"commit": report["commit"]})
                     print(json.dumps(run, default=float), file=sys.stderr, flush=True)
-    report = describe_machine() | {"runs": sorted(runs, key=lambda run: order.index(run["case"]))}
+    report["runs"] = sorted(runs, key=lambda run: order.index(run["case"]))
     args.output.write_text(json.dumps(report, indent=1, default=float) + "\n")
     args.output.with_suffix(".md").write_text(markdown(report))
     print(markdown(report), end="")
