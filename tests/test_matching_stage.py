@@ -72,6 +72,20 @@ def as_bytes(correspondences: Correspondences) -> dict[str, bytes]:
     return {f.name: getattr(correspondences, f.name).tobytes() for f in fields(correspondences)}
 
 
+@pytest.mark.parametrize("num_common", [0, 60])
+def test_pairs_with_nothing_in_common_are_given_up_after_a_look(num_common: int) -> None:
+    features, shown, _ = make_features(2, 1500)
+    others, _, _ = make_features(1, 1500, seed=1)
+    is_common = np.isin(shown[1], np.intersect1d(*shown)[:num_common])
+    descriptors = np.where(is_common[:, None], features[1].descriptors, others[0].descriptors[: len(shown[1])])
+    second = Features(features[1].keypoints, descriptors, features[1].rgb)
+    found, report = run([features[0], second], MatchingOptions(coarse_features=300))
+    pair = report["pairs"][0]
+    assert (pair["num_compared"], report["num_unlike_pairs"]) == ((None, 0) if num_common else (600, 1))
+    assert not pair["is_guided"]
+    assert (len(found.matches) > 0.9 * num_common) == bool(num_common)
+
+
 @pytest.mark.parametrize("coarse_features", [300, 100_000], ids=["guided", "full"])
 def test_matches_and_poses_are_right(coarse_features: int) -> None:
     features, shown, poses = make_features(4, 1500)

@@ -27,6 +27,9 @@ _BAND_PER_THRESHOLD = 2.0
 _MIN_COARSE_SHARE = 0.7
 # Of the matches that the coarse ones promise, in proportion to the number of features, so many must be found.
 _MIN_KEPT_PROMISE = 0.5
+# Two images have nothing in common where matches of the largest features, a quarter to a half of all, promise less than
+# this share of the inliers that a pair needs even by a stricter ratio test. A look at fewer lost a true pair of 17.
+_SURE_RATIO, _MIN_SURE_SHARE = 0.75, 0.5
 
 
 @dataclass(frozen=True)
@@ -37,11 +40,13 @@ class Putative:
         matches: (K, 2) int32 positions in both images; no position occurs twice.
         fundamental: (3, 3) that guided them, None if they were matched in full.
         num_coarse: matches among the largest features, None if they were not tried first.
+        num_compared: features of each image after which there was no more hope, None where there was.
     """
 
     matches: NDArray[np.int32]
     fundamental: NDArray[np.float64] | None = None
     num_coarse: int | None = None
+    num_compared: int | None = None
 
 
 def is_guidable(features: Features, options: MatchingOptions) -> bool:
@@ -73,13 +78,24 @@ def match_features(
     search, limits, num_coarse = ProductSearch(first, second), (options.max_ratio, options.max_distance), None
     if backgrounds[0] is not None and backgrounds[1] is not None:
         images = GuidedImage.of(features[0], backgrounds[0]), GuidedImage.of(features[1], backgrounds[1])
-        coarse = mutual_neighbors(*search.among_first(options.coarse_features), *limits)
-        found = _match_coarse_to_fine(*images, coarse, threshold_px, options, ransac)
-        if found is not None:
-            return found
-        num_coarse = len(coarse)
+        num_all = min(len(first), len(second))
+        for size in _sizes_of_looks(num_all, options):
+            best = search.among_first(size)
+            coarse = mutual_neighbors(*best, *limits)
+            found = _match_coarse_to_fine(*images, coarse, size, threshold_px, options, ransac)
+            if found is not None:
+                return found
+            num_coarse = len(coarse)
+        num_sure = len(mutual_neighbors(*best, min(_SURE_RATIO, options.max_ratio), options.max_distance))
+        if num_sure * num_all < _MIN_SURE_SHARE * options.min_inliers * size:
+            return Putative(coarse, None, num_coarse, size)
     best = search.among_first(max(len(first), len(second)))
     return Putative(mutual_neighbors(*best, *limits), None, num_coarse)
+
+
+def _sizes_of_looks(num_features: int, options: MatchingOptions) -> list[int]:
+    """Features of each image, largest first, that are compared before all are: no more than half of them."""
+    return [size for size in (options.coarse_features, 2 * options.coarse_features) if 2 * size <= num_features]
 
 
 def _common_metric(first: Features, second: Features) -> DescriptorMetric:
@@ -96,12 +112,13 @@ def _match_coarse_to_fine(
     image1: GuidedImage,
     image2: GuidedImage,
     coarse: NDArray[np.int32],
+    size: int,
     threshold_px: float,
     options: MatchingOptions,
     ransac: Ransac,
 ) -> Putative | None:
-    """Matches of all features guided by coarse ones (K, 2), those of the largest of each image; None where these
-    are not to be trusted."""
+    """Matches of all features guided by coarse ones (K, 2), those among the first ``size`` of each image; None where
+    these are not to be trusted."""
     if len(coarse) < max(options.min_inliers, 8):
         return None
     xy1, xy2 = _points(image1, image2, coarse)
@@ -120,7 +137,7 @@ def _match_coarse_to_fine(
     guided = match_guided(image1, image2, fundamental, _BAND_PER_THRESHOLD * threshold_px, change, *limits)
     xy1, xy2 = _points(image1, image2, guided)
     fundamental, guided_inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
-    promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / options.coarse_features
+    promise = inlier.sum() * min(len(image1.descriptors), len(image2.descriptors)) / size
     if guided_inlier.sum() < _MIN_KEPT_PROMISE * promise:
         return None
     return Putative(guided, fundamental, len(coarse))

@@ -35,6 +35,8 @@ class PairReport(Report):
         config: of its two-view geometry; see :class:`~sfmapp.scene.correspondences.TwoViewConfig`.
         num_coarse: matches among the largest features that were to guide the others; None if there was no need.
         is_guided: they did.
+        num_compared: features of each image, largest first, that showed nothing in common, so that the rest was left
+            out; None: all were compared.
         num_putative, num_verified: matches before and after verification.
         num_inliers_f, num_inliers_e, num_inliers_h: of fundamental matrix, essential matrix and homography.
         median_angle_deg: between the rays of its matches; None: not known.
@@ -44,6 +46,7 @@ class PairReport(Report):
     config: str
     num_coarse: int | None
     is_guided: bool
+    num_compared: int | None
     num_putative: int
     num_verified: int
     num_inliers_f: int
@@ -59,6 +62,7 @@ class MatchingReport(Report):
     Attributes:
         num_resumed_pairs: those of an earlier run.
         num_matches: verified ones, of all pairs.
+        num_unlike_pairs: pairs whose largest features showed nothing in common.
         num_pairs_with_moving_plane: pairs in which something flat moves differently from the scene.
         configs: pairs by their two-view geometry.
         cpu_s: of the workers.
@@ -68,6 +72,7 @@ class MatchingReport(Report):
     num_resumed_pairs: int
     num_verified_pairs: int
     num_matches: int
+    num_unlike_pairs: int
     num_pairs_with_moving_plane: int
     configs: Mapping[str, int]
     cpu_s: float

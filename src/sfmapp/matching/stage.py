@@ -54,6 +54,7 @@ class MatchedPair:
         geometry: the two-view geometry; its ``is_inlier`` is dropped for the matches above.
         num_coarse: matches among the largest features that were to guide the others, None if there was no need.
         is_guided: they did.
+        num_compared: features of each image, largest first, that showed nothing in common; None: all were compared.
         cpu_s: processor seconds of the thread that did it.
     """
 
@@ -62,6 +63,7 @@ class MatchedPair:
     geometry: TwoViewGeometry
     num_coarse: int | None = None
     is_guided: bool = False
+    num_compared: int | None = None
     cpu_s: float = 0.0
 
 
@@ -254,6 +256,7 @@ def match_pair(
         geometry,
         putative.num_coarse,
         putative.fundamental is not None,
+        putative.num_compared,
         time.thread_time() - start,
     )
 
@@ -310,6 +313,7 @@ def _report(
         num_resumed_pairs=num_known,
         num_verified_pairs=sum(len(r.matches) > 0 for r in results),
         num_matches=sum(len(r.matches) for r in results),
+        num_unlike_pairs=sum(r.num_compared is not None for r in results),
         num_pairs_with_moving_plane=sum(r.geometry.num_moving_alone > 0 for r in results),
         configs={name: configs.count(name) for name in sorted(set(configs))},
         cpu_s=sum(r.cpu_s for r in results),
@@ -326,6 +330,7 @@ def _pair_report(pair: tuple[int, int], result: MatchedPair) -> PairReport:
         config=geometry.config.name,
         num_coarse=result.num_coarse,
         is_guided=result.is_guided,
+        num_compared=result.num_compared,
         num_putative=result.num_putative,
         num_verified=len(result.matches),
         num_inliers_f=geometry.num_inliers_f,
