@@ -1,5 +1,4 @@
-"""Space carving: the octree beside a dense grid of numpy, the dinosaur, the bunny beside its mesh, silhouettes with
-holes and spills.
+"""Space carving: the octree beside a dense grid of numpy, the dinosaur, the bunny beside its mesh.
 
     SFMAPP_DATA=... python benchmarks/carving.py
 
@@ -8,9 +7,7 @@ a better one asks only about cells that are still there. Whether the same cells 
 which reads distances between pixels as the octree does. CPU seconds are those of one run on one thread, compiled
 kernels loaded; of the dense grids every eighth slab, times eight. The dinosaur is a process of its own from photographs
 to the closed surface.
-The bunny's hull is held against the mesh that its masks were rendered from. Masks with a twentieth of their area gone
-(a disk at a drawn place inside), or added (at a drawn place of the outline): one photograph in ten, exact scenes of the
-tests and nerf-lego-small, against the hull of the clean ones.
+The bunny's hull is held against the mesh that its masks were rendered from.
 """
 
 from __future__ import annotations
@@ -28,20 +25,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from machine import RESULTS, ROOT, describe_machine
-
-sys.path.insert(0, str(ROOT / "tests"))
-
-from carving_scenes import around, ball, both, box, ring, silhouette_of, without
 from sfmapp.carve.box import find_box
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.octree import Octree, codes_of
 from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
 from sfmapp.carve.space_carving import CarveOptions, carve, carve_hull
-from sfmapp.carve.tolerance import doubt_holes
 from sfmapp.carve.views import View, project_points
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet
@@ -53,21 +44,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
-DINOSAUR, BUNNY, LEGO = (DATA / name for name in ("oxford-dinosaur", "vacancy-bunny", "nerf-lego-small"))
+DINOSAUR, BUNNY = (DATA / name for name in ("oxford-dinosaur", "vacancy-bunny"))
 # the bunny's K counts pixel centres at integers, ours at a half
 BUNNY_CAMERA = "PINHOLE,258.65,258.25,159.8,128.15"
 GRID, FINE, SLAB, SAMPLED = 256, 1024, 8, 8
-SPOILED, AREA, SEEDS = 0.1, 0.05, 2
 # samples of a pixel along each side where shapes are drawn
 SUPER = 8
-SOLIDS = {
-    "ball": ball(),
-    "box": box(),
-    "ring": ring(),
-    "ball and bar": both(ball(0.6), box((0.9, 0.25, 0.2))),
-    "two bodies": both(ball(0.45, (0.5, 0.0, 0.3)), box((0.3, 0.5, 0.6), (-0.4, 0.0, 0.0))),
-    "box with a slot": without(box(), box((0.2, 2.0, 0.2))),
-}
 
 
 def load(folder: Path, poses: Path | None = None, camera: str | None = None) -> tuple[list[View], list[Silhouette]]:
@@ -282,68 +264,6 @@ def bunny() -> dict[str, Any]:
     }
 
 
-# --------------------------------------------------------------------------------------- silhouettes with holes, spills
-
-
-def spoil(silhouette: Silhouette, kind: str, rng: np.random.Generator) -> Silhouette:
-    """A disk less, or more, at a drawn place: a twentieth of the area."""
-    mask = silhouette.inside
-    height, width = mask.shape
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-    edge = ~mask & (distance_transform_edt(~mask) < 1.5)
-    candidates = np.argwhere(mask if kind == "hole" else edge)
-    y, x = candidates[rng.integers(len(candidates))]
-    away = np.linalg.norm(grid - [x, y], axis=-1)
-    changes = mask if kind == "hole" else ~mask
-    radius = np.sort(away[changes])[int(AREA * mask.sum())]
-    mask = mask & (away > radius) if kind == "hole" else mask | (away <= radius)
-    distance = distance_transform_edt(mask) - distance_transform_edt(~mask)
-    return Silhouette((distance - 0.5 * np.sign(distance)).astype(np.float32))
-
-
-def tolerance_of(
-    case: str, views: list[View], clean: list[Silhouette], low: Array, side: float
-) -> list[dict[str, Any]]:
-    at = (np.arange(64) + 0.5) / 64 * side
-    grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3) + low
-    whole = hull_of(views, clean).distance(grid) > 0.0
-    _, untouched = doubt_holes(views, clean, low, side)
-    rows = []
-    for kind in ("hole", "spill"):
-        for seed in range(SEEDS):
-            rng = np.random.default_rng(seed)
-            bad = sorted(rng.choice(len(views), max(1, round(SPOILED * len(views))), replace=False).tolist())
-            spoiled = [spoil(s, kind, rng) if i in bad else s for i, s in enumerate(clean)]
-            mended, report = doubt_holes(views, spoiled, low, side)
-            named = {one.name for one in report.doubted}
-            rows.append(
-                {
-                    "case": case,
-                    "kind": kind,
-                    "seed": seed,
-                    "views": len(views),
-                    "spoiled": len(bad),
-                    "strict": iou(hull_of(views, spoiled).distance(grid) > 0.0, whole),
-                    "tolerant": iou(hull_of(views, mended).distance(grid) > 0.0, whole),
-                    "found": len(named & {views[i].name for i in bad}),
-                    "wrongly_named": len(named - {views[i].name for i in bad}),
-                    "named_if_clean": len(untouched.doubted),
-                }
-            )
-            print(rows[-1], flush=True)
-    return rows
-
-
-def tolerance() -> list[dict[str, Any]]:
-    rows = []
-    views = around(20, height=160, elevation_deg=35.0)
-    for name, solid in SOLIDS.items():
-        rows += tolerance_of(name, views, [silhouette_of(v, solid) for v in views], np.full(3, -1.3), 2.6)
-    views, silhouettes = load(LEGO)
-    low, side = find_box(views, silhouettes).cube()
-    return rows + tolerance_of("nerf-lego-small", views, silhouettes, low, side)
-
-
 # -------------------------------------------------------------------------------------------------------------- results
 
 
@@ -393,12 +313,6 @@ def markdown(report: dict[str, Any]) -> str:
         "with pixel centres at integers, as the source's principal point counts them, and to "
         f"{min(bunny_told['mesh_iou_half_a_pixel_off']):.4f} to {max(bunny_told['mesh_iou_half_a_pixel_off']):.4f} "
         "half a pixel off.",
-        "",
-        "## One silhouette in ten with a twentieth of its area gone or added: IoU with the hull of clean ones",
-        "",
-        "| case | views | | strict, least | tolerant, least | within 0.01 | found | wrongly named | named if clean |",
-        "|---|---|---|---|---|---|---|---|---|",
-        *tolerance_lines(report["tolerance"]),
     ]
     return "\n".join(lines) + "\n"
 
@@ -413,24 +327,11 @@ def dinosaur_line(run: dict[str, Any]) -> str:
     return first + f"{run['carve_s']:.1f} | {run['surface_s']:.1f} | {run['triangles']} | {closed} |"
 
 
-def tolerance_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines = []
-    for case, kind in dict.fromkeys((row["case"], row["kind"]) for row in rows):
-        mine = [row for row in rows if (row["case"], row["kind"]) == (case, kind)]
-        lines.append(
-            f"| {case} | {mine[0]['views']} | {kind} | {min(r['strict'] for r in mine):.4f} | "
-            f"{min(r['tolerant'] for r in mine):.4f} | {sum(r['tolerant'] >= 0.99 for r in mine)} of {len(mine)} | "
-            f"{sum(r['found'] for r in mine)} of {sum(r['spoiled'] for r in mine)} | "
-            f"{sum(r['wrongly_named'] for r in mine)} | {mine[0]['named_if_clean']} |"
-        )
-    return lines
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "carving.json")
     parser.add_argument("--dinosaur", type=int, metavar="CELLS", help=argparse.SUPPRESS)
-    parser.add_argument("--only", choices=("grid", "dinosaur", "bunny", "tolerance"), help="do the others again later")
+    parser.add_argument("--only", choices=("grid", "dinosaur", "bunny"), help="do the others again later")
     args = parser.parse_args()
     if args.dinosaur is not None:
         dinosaur_child(args.dinosaur)
@@ -439,7 +340,6 @@ def main() -> None:
         "dinosaur": lambda: [dinosaur(cells) for cells in (512, 2048)],
         "bunny": bunny,
         "grid": lambda: beside_a_grid(*load(DINOSAUR)),
-        "tolerance": tolerance,
     }
     report = json.loads(args.output.read_text()) if args.only and args.output.is_file() else {}
     report |= describe_machine()
