@@ -80,6 +80,26 @@ def test_background_is_learned() -> None:
     assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.98
 
 
+def test_colors_that_tell_little_leave_it_to_cuts_of_single_photographs() -> None:
+    # half of the object is as light as the wall behind it: where the object ends in each photograph is told by the rest
+    pictures = []
+    for seed, coverage in enumerate(COVERAGES):
+        rng = np.random.default_rng(seed)
+        light = np.linspace(0.5, 1.0, coverage.shape[1])[None, :, None]
+        color = np.where(
+            coverage[..., None] > 0.5, np.array([220.0, 150.0, 120.0]) * light, np.array([150.0, 135.0, 120.0])
+        )
+        wall = np.linspace(0.7, 1.05, coverage.shape[0])[:, None, None]
+        color = np.where(coverage[..., None] > 0.5, color, color * wall) + rng.normal(0.0, 3.0, color.shape)
+        pictures.append(np.clip(color.round(), 0, 255).astype(np.uint8))
+    silhouettes, report = found_in(pictures)
+    assert report.color_error is not None
+    assert report.color_error > 0.025
+    assert {mask.source for mask in report.masks} == {"grabcut"}
+    assert "look alike" in report.warnings[0]
+    assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.9
+
+
 def test_a_cut_mends_a_rough_mask() -> None:
     for seed, (picture, coverage) in enumerate(zip(PHOTOGRAPHS[:3], COVERAGES, strict=False)):
         rng, true = np.random.default_rng(seed), coverage > 0.5
