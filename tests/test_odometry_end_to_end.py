@@ -133,6 +133,8 @@ def test_a_second_run_is_localised_in_the_first_and_a_third_in_both(
     options = options_of(room, "scale.source=camera_height:1.5", f"odometry.known_map={second}")
     with pytest.raises(UsageError, match="the unit of length is that of the map"):
         track_sequence(room / "frames", tmp_path / "other", options)
+    with pytest.raises(UsageError, match="is the map itself"):
+        track_sequence(room / "frames", second, options_of(room, f"odometry.known_map={second}"))
 
 
 def test_what_contradicts_a_map_is_read_again_with_it(tracked: tuple[Path, TrackResult], tmp_path: Path) -> None:

@@ -21,10 +21,11 @@ from sfmapp.odometry.inertial.smoothing import smooth_trajectory
 from sfmapp.odometry.initialize import MapInitializer, TwoViews
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.known_map_check import KnownMapCheck
+from sfmapp.odometry.loops.relocalize import position_of
 from sfmapp.odometry.loops.sweep import is_too_large
 from sfmapp.odometry.map.atlas import Atlas
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
-from sfmapp.odometry.map.known_map import KnownMap, known_keyframes
+from sfmapp.odometry.map.known_map import PREFIX, KnownMap, known_keyframes
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.motion_model import MotionModel
 from sfmapp.odometry.options import OdometryOptions
@@ -278,7 +279,10 @@ class Odometry:
         self._count_mapped()
         self._settle(record, state, tracked.pose, is_keyframe=True)
         self._remember(view)
-        self._tell(reason, num_tracks=len(tracked.tracks), num_mapped=tracked.num_mapped_at_keyframe)
+        self._tell(
+            reason, everything=state is FrameState.RELOCALIZED and local.keyframes.num_known > 0,
+            num_tracks=len(tracked.tracks), num_mapped=tracked.num_mapped_at_keyframe,
+        )  # fmt: skip
         self._question_calibration(record)
 
     def _question_calibration(self, record: FrameRecord) -> None:
@@ -355,7 +359,11 @@ class Odometry:
         self._find_known(view)
         self.motion.stop()
         self.counts.relocalizations += 1
-        self._make_keyframe(record, view, FrameState.RELOCALIZED, f"relocalised at frame {frame_idx}")
+        reason = f"relocalised at frame {frame_idx}"
+        if frame_idx < 0:
+            seen = self.local.keyframes.keyframes[position_of(self.local.keyframes, frame_idx)]
+            reason = f"found in the known map at {seen.name.removeprefix(PREFIX)}"
+        self._make_keyframe(record, view, FrameState.RELOCALIZED, reason)
         return True
 
     def _find_known(self, view: View) -> None:

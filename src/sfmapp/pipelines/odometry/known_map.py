@@ -49,12 +49,13 @@ class ReadMap:
         return Rig(found.cameras[:num], found.cam_from_rig[:num])
 
 
-def read_known_map(folder: Path, options: Options, events: Events) -> ReadMap:
+def read_known_map(folder: Path, options: Options, events: Events, above: tuple[Path, ...] = ()) -> ReadMap:
     """Read the largest map of a run, or a COLMAP model, with its pictures.
 
     Args:
         folder: OUT of ``odometry`` or ``reconstruct``, or the folder of a COLMAP model with its photographs.
         options: of the run that is to be localised; masks and limits of photographs count here.
+        above: maps that were made in this one, from whose reading this is called.
 
     Raises:
         InputError, UsageError: it is none of these, or its frames or photographs are gone.
@@ -62,7 +63,7 @@ def read_known_map(folder: Path, options: Options, events: Events) -> ReadMap:
     """
     events.started(STAGE, f"reading the map in {folder}")
     if (folder / MANIFEST).is_file() and read_manifest(folder).command == ODOMETRY:
-        found = _of_odometry(folder, options, events)
+        found = _of_odometry(folder, options, events, (*above, folder.resolve()))
     else:
         found = ReadMap(_of_photographs(folder, options, events))
     known = found.known
@@ -70,7 +71,7 @@ def read_known_map(folder: Path, options: Options, events: Events) -> ReadMap:
     return found
 
 
-def _of_odometry(folder: Path, options: Options, events: Events) -> ReadMap:
+def _of_odometry(folder: Path, options: Options, events: Events, above: tuple[Path, ...]) -> ReadMap:
     manifest, odometry = read_manifest(folder, ODOMETRY), read_odometry(folder)
     if not odometry.maps:
         raise NoReconstructionError(f"{folder} holds no map", "run sfmapp odometry again")
@@ -89,19 +90,26 @@ def _of_odometry(folder: Path, options: Options, events: Events) -> ReadMap:
             pictures[image] = as_gray(source.pixels(model.image_names[image]))
     earlier = options_from_dict({"odometry": manifest.options.get("odometry", {})}).odometry.known_map
     if earlier is not None:
-        pictures |= _of_earlier(Path(earlier), model, options, events)
+        if Path(earlier).resolve() in above:
+            raise InputError(f"{folder} and {earlier} say that each was made in the other", "run one of them again")
+        before = _read_earlier(Path(earlier), options, events, above)
+        pictures |= {} if before is None else _pictures_of(before, model)
     known = KnownMap(str(folder), model, _by_rig(model), pictures, entry.scale_source, entry.scale_sigma)
     return ReadMap(known, sequence.rig)
 
 
-def _of_earlier(folder: Path, model: Reconstruction, options: Options, events: Events) -> dict[int, NDArray[np.uint8]]:
-    """Pictures of the images that a map has of the one that it was made in, by image; none if that is gone."""
-    image_of = {name: image for image, name in enumerate(model.image_names) if name.startswith(PREFIX)}
+def _read_earlier(folder: Path, options: Options, events: Events, above: tuple[Path, ...]) -> KnownMap | None:
+    """The map that another one was made in; None if it is gone."""
     try:
-        before = read_known_map(folder, options, events).known
+        return read_known_map(folder, options, events, above).known
     except InputError as error:
-        events.warned(STAGE, f"the map that this one was made in is gone, and what it looks like: {error}")
-        return {}
+        events.warned(STAGE, f"what a part of the map looks like is not known: {error}")
+        return None
+
+
+def _pictures_of(before: KnownMap, model: Reconstruction) -> dict[int, NDArray[np.uint8]]:
+    """Pictures of the images that a map has of the one that it was made in, by image."""
+    image_of = {name: image for image, name in enumerate(model.image_names) if name.startswith(PREFIX)}
     found = {}
     for image, picture in before.pictures.items():
         here = image_of.get(PREFIX + before.model.image_names[image])

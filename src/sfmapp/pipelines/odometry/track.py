@@ -93,17 +93,25 @@ def track_sequence(
             "observation each takes ten times as long",
             "leave it out; sfmapp refine --set adjust.backend=gtsam adjusts the finished map so",
         )
-    if options is not None and options.odometry.known_map is not None and options.scale.source is not None:
-        raise UsageError(
-            f"--scale {options.scale.source}: the unit of length is that of the map in {options.odometry.known_map}",
-            "leave it out, or give that map its metres",
-        )
+    if options is not None and options.odometry.known_map is not None:
+        _check_known_map(options.odometry.known_map, output, options.scale.source)
     request = parse_scale(options.scale.source) if options is not None and options.scale.source is not None else None
     with Tracking.opened(
         ODOMETRY, name, output, options, events=events, watch=watch, scale_request=request, sequence=sequence
     ) as run:
         run.listen_in(record, screen)
         return _run(run, self_calibrate)
+
+
+def _check_known_map(known_map: str, output: str | os.PathLike[str], scale: str | None) -> None:
+    """Raises UsageError where the results would replace the map, or a scale contradict its unit of length."""
+    if scale is not None:
+        raise UsageError(
+            f"--scale {scale}: the unit of length is that of the map in {known_map}",
+            "leave it out, or give that map its metres",
+        )
+    if Path(known_map).resolve() == Path(output).resolve():
+        raise UsageError(f"{known_map} is the map itself, which the results would replace", "choose another OUT")
 
 
 def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
