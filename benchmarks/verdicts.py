@@ -621,6 +621,24 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "on wheels, ramps and leaning cars among them, planar motion has a NEES below 2"
     honest = [planar["nees"] < 2.0 for _, planar in pairs if planar.get("nees") is not None]
     yield Promise("wheeled", text, sum(honest), len(honest), report["date"][:10])
+    report = read(folder, "known_maps")
+    rows, date = report["rows"], report["date"][:10]
+    inside = [row for row in rows if row["expected"] == "in the map"]
+    outside = [row for row in rows if row["expected"] != "in the map"]
+    text = "a sequence in a known map is found there, loses no frame and agrees with it"
+    good = [
+        bool(row["known_map"].get("is_found"))
+        and not row["contradicted"]
+        and row["num_with_pose"] >= row["num_with_pose_alone"]
+        for row in inside
+    ]
+    yield Promise("known_maps", text, sum(good), len(inside), date)
+    again = [row for row in inside if "backwards" in row["case"]]
+    text = "the same way once more in its map has a smaller error than the first run"
+    yield Promise("known_maps", text, sum(row["ate_m"] < row["first_ate_m"] for row in again), len(again), date)
+    text = "another place, or one that looks the same, is not taken for one of a known map"
+    good = [not row["known_map"].get("is_found") for row in outside]
+    yield Promise("known_maps", text, sum(good), len(outside), date)
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])

@@ -95,6 +95,10 @@ class Recognition:
         self, maps: dict[int, LocalMap], seen: PlaceView, found: Relocalization, roll: float = 0.0
     ) -> bool:
         """Whether what was found in a known map might be another place of it, and so is not to be believed."""
+        if self.num_ambiguous:
+            # seen once at two places, the camera is between things that look alike: the next view, in which one of
+            # them falls just short, tells nothing (a street of equal houses: 20 m off, and sure)
+            return True
         known = maps[found.map_idx].keyframes
         is_open = is_ambiguous(known, self._places, seen, found, RelocalizeOptions(), roll)
         self.num_ambiguous += is_open
