@@ -108,6 +108,7 @@ def rows_of(folder: Path) -> list[Row]:
         "voxel_coloring": color_rows,
         "shadow_carving": shadow_rows,
         "masks": mask_rows,
+        "matching": matching_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -294,6 +295,18 @@ def uncalibrated_rows(folder: Path) -> Iterator[Row]:
             yield Row(
                 "uncalibrated", case, "transfer, median", "px", "less", row["tensor"]["median_px"], "", None, *about
             )
+
+
+def matching_rows(folder: Path) -> Iterator[Row]:
+    """The matching stage against itself at an earlier commit."""
+    report = read(folder, "matching")
+    about = (False, report["date"][:10], report["commit"])
+    peer = f"sfmapp at {report['before']}"
+    for row in report["sets"]:
+        now, before = row["now"], row["before"]
+        yield Row("matching", row["set"], "CPU time", "s", "less", now["cpu_s"], peer, before["cpu_s"], *about)
+        pairs, pairs_before = len(now["pairs"]), len(before["pairs"])
+        yield Row("matching", row["set"], "verified pairs", "count", "more", pairs, peer, pairs_before, *about)
 
 
 def plane_rows(folder: Path) -> Iterator[Row]:
