@@ -29,8 +29,8 @@ class MatchingOptions:
         max_ratio: Largest ratio of the best distance to the second best, in both directions (Lowe, IJCV 2004).
         max_distance: Largest distance of a match.
         coarse_features: Features of each image, largest first, whose matches guide those of all others along the
-            epipolar lines. Images with fewer than twice as many, and pairs on which these do not agree, are matched in
-            full.
+            epipolar lines; twice as many where there are four times. Pairs in which these show nothing in common are
+            given up. Images with fewer than twice as many, and pairs on which they do not agree, are matched in full.
         max_error_px: Inlier threshold in pixels of the full-size image. None: 0.2 % of the image diagonal, within
             2 to 8 px.
         min_inliers: Verified matches that a pair needs to be used.
