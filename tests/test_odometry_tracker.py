@@ -11,6 +11,7 @@ from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.records import FrameRecord, gather, measure_again
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
+from sfmapp.odometry.report import AdjustmentReport, CalibrationCheck
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.tracker import MIN_INLIERS, measure_pose
 from sfmapp.scene.rig import Rig
@@ -111,7 +112,7 @@ def record(frame: int, map_idx: int = -1, keyframe: int = -1, shift: float = 0.0
     return out
 
 
-NO_WORD = FinalAdjustment(None, "", {})
+NO_WORD = FinalAdjustment(None, "", AdjustmentReport(camera=CalibrationCheck(is_refined=False)))
 
 
 def test_the_map_with_the_most_frames_comes_first_and_gaps_stay_gaps() -> None:
