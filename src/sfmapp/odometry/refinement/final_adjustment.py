@@ -34,7 +34,7 @@ from sfmapp.odometry.refinement.calibration_check import (
     question_calibration,
 )
 from sfmapp.odometry.refinement.inertial_adjustment import adjust_with_imu
-from sfmapp.odometry.refinement.planar_adjustment import PlanarMap, hold_to_plane, offer_plane
+from sfmapp.odometry.refinement.motion_plane import offer_plane
 from sfmapp.odometry.report import AdjustmentReport, PlaneEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.rig import Rig
@@ -194,6 +194,9 @@ def _with_plane(
         reason = f"the observations do not determine the poses, or keyframes are more than {MAX_COVARIANCE_KEYFRAMES}"
         found = PlaneEvidence(state="dropped", reason=reason)
     else:
+        # gtsam is not imported for a motion that is free
+        from sfmapp.odometry.refinement.planar_adjustment import PlanarMap, hold_to_plane
+
         adjust = AdjustOptions(
             loss="cauchy", loss_scale_px=LOSS_SIGMAS * sigma, refine_focal=False, refine_distortion=False
         )

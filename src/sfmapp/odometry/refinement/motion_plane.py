@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.odometry.report import PlaneEvidence
 
 Array = NDArray[np.float64]
 
@@ -19,6 +20,8 @@ Array = NDArray[np.float64]
 _TILT_RAD, _HEIGHT_SHARE, _ROUNDS = 0.01, 0.01, 10
 # Deviations are never taken to be smaller, so that an exact plane is no singular weight.
 _LEAST_TILT_RAD, _LEAST_HEIGHT_SHARE = 1e-5, 1e-6
+# Fewest keyframes that tell three variances.
+MIN_KEYFRAMES = 10
 # A camera on wheels looks about level; this says so where the motion, straight on, does not tell the plane.
 _MOUNTED_RAD = 0.35
 # What looks like a vehicle on level ground: it nods and rolls by less than this, leaves its plane by less than this
@@ -88,6 +91,31 @@ def fit_motion_plane(cam_from_map: Array) -> MotionPlane | None:
     flat /= np.maximum(np.linalg.norm(flat, axis=1), 1e-12)[:, None]
     turned = float(np.arccos(np.clip((flat @ flat.T).min(), -1.0, 1.0)))
     return MotionPlane(normal, float(middle @ normal), up, basis, deviations, turned, size)
+
+
+def offer_plane(cam_from_map: Array) -> PlaneEvidence | None:
+    """What speaks for it that a camera, whose motion was taken to be free, was on wheels on level ground; None where
+    nothing does."""
+    plane = fit_motion_plane(cam_from_map) if len(cam_from_map) >= MIN_KEYFRAMES else None
+    if plane is None or not plane.looks_level:
+        return None
+    nod, roll, height = np.sqrt((plane.deviations**2).mean(0))
+    reason = (
+        f"the camera turned by {np.degrees(plane.turned_rad):.0f} degrees and nodded and rolled by "
+        f"{np.degrees(nod):.2f} and {np.degrees(roll):.2f}; it left a plane by {height / plane.size:.2%} of its way: "
+        "odometry.motion=planar would hold it there as well as it keeps to it"
+    )
+    return unheld(plane, reason, state="offered")
+
+
+def unheld(plane: MotionPlane, reason: str, state: str = "dropped") -> PlaneEvidence:
+    """Evidence of a plane that nothing was adjusted with."""
+    deviation = np.sqrt((plane.deviations**2).mean(0))
+    return PlaneEvidence(
+        state=state, reason=reason, turned_deg=float(np.degrees(plane.turned_rad)),
+        deviation_deg=np.degrees(deviation[:2]).tolist(), deviation_height=float(deviation[2]),
+        up_in_cam=plane.up_in_cam.tolist(),
+    )  # fmt: skip
 
 
 def tangents(up: Array) -> Array:

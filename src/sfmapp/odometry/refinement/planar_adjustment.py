@@ -25,19 +25,19 @@ from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.refinement.motion_plane import (
+    MIN_KEYFRAMES,
     MIN_TURN_RAD,
     MotionPlane,
     fit_motion_plane,
     shared_factor,
     tangents,
+    unheld,
 )
 from sfmapp.odometry.report import PlaneEvidence
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 
-# Fewest keyframes that tell three variances.
-_MIN_KEYFRAMES = 10
 # Rounds of learning the variances, and the relative change of a standard deviation that ends them.
 _ROUNDS, _SETTLED = 6, 0.03
 _MAX_STEPS, _TOLERANCE, _DAMPING = 30, 1e-6, 1e-6
@@ -83,13 +83,13 @@ def hold_to_plane(
         The map, or why there is no such plane.
     """
     poses = model.cam_from_world[::num_sensors]
-    plane = fit_motion_plane(poses) if len(poses) >= _MIN_KEYFRAMES else None
+    plane = fit_motion_plane(poses) if len(poses) >= MIN_KEYFRAMES else None
     if plane is None:
         return PlaneEvidence(state="dropped", reason=f"{len(poses)} keyframes tell no plane of motion")
     if plane.turned_rad < MIN_TURN_RAD:
         # about so straight a way a normal of any roll fits: what sways aside would be taken for heights
         turned, least_turn = np.degrees([plane.turned_rad, MIN_TURN_RAD])
-        return _unheld(plane, f"turns of {turned:.0f} degrees tell no plane, {least_turn:.0f} are asked for")
+        return unheld(plane, f"turns of {turned:.0f} degrees tell no plane, {least_turn:.0f} are asked for")
     sigmas = np.sqrt((plane.deviations**2).mean(0))
     least = np.array([1e-5, 1e-5, 1e-6 * plane.size])
     graph, found, start = None, None, model
@@ -98,7 +98,7 @@ def hold_to_plane(
         report = graph.optimize()
         found = graph.read()
         if found is None:
-            return _unheld(plane, "the observations do not determine the poses beside the plane")
+            return unheld(plane, "the observations do not determine the poses beside the plane")
         start = graph.model
         before, sigmas = sigmas, np.maximum(found.learned, least)
         if np.abs(np.log(sigmas / np.maximum(before, least))).max() < _SETTLED:
@@ -110,31 +110,6 @@ def hold_to_plane(
     if reason is not None:
         return replace(evidence, state="dropped", reason=reason)
     return PlanarMap(graph.model, found.poses, report, evidence)
-
-
-def offer_plane(cam_from_map: Array) -> PlaneEvidence | None:
-    """What speaks for it that a camera, whose motion was taken to be free, was on wheels on level ground; None where
-    nothing does."""
-    plane = fit_motion_plane(cam_from_map) if len(cam_from_map) >= _MIN_KEYFRAMES else None
-    if plane is None or not plane.looks_level:
-        return None
-    nod, roll, height = np.sqrt((plane.deviations**2).mean(0))
-    reason = (
-        f"the camera turned by {np.degrees(plane.turned_rad):.0f} degrees and nodded and rolled by "
-        f"{np.degrees(nod):.2f} and {np.degrees(roll):.2f}; it left a plane by {height / plane.size:.2%} of its way: "
-        "odometry.motion=planar would hold it there as well as it keeps to it"
-    )
-    return _unheld(plane, reason, state="offered")
-
-
-def _unheld(plane: MotionPlane, reason: str, state: str = "dropped") -> PlaneEvidence:
-    """Evidence of a plane that nothing was adjusted with."""
-    deviation = np.sqrt((plane.deviations**2).mean(0))
-    return PlaneEvidence(
-        state=state, reason=reason, turned_deg=float(np.degrees(plane.turned_rad)),
-        deviation_deg=np.degrees(deviation[:2]).tolist(), deviation_height=float(deviation[2]),
-        up_in_cam=plane.up_in_cam.tolist(),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
