@@ -92,6 +92,27 @@ def test_the_octree_keeps_what_a_dense_grid_keeps(lens: str) -> None:
     assert [level.looked_at for level in report.levels[:3]] == [1, 8, 64]
 
 
+@pytest.mark.parametrize(("lens", "misses"), [("plain", 0), ("plain", 2), ("fisheye", 1)])
+def test_views_that_are_not_asked_are_no_nearer(lens: str, misses: int) -> None:
+    views = around(9, width=200, height=200)
+    views = wide_views(views) if lens == "fisheye" else views
+    silhouettes = [silhouette_of(view, both(ring(), box((0.2, 0.3, 0.7)))) for view in views]
+    known = np.ones((views[3].height, views[3].width), bool)
+    known[:, :70] = False
+    silhouettes[3] = Silhouette(silhouettes[3].distance, known)
+    hull = hull_of(views, silhouettes, min_views=6, misses=misses)
+    # near each other, and beyond most pictures
+    rng = np.random.default_rng(1)
+    points = np.concatenate([lattice(CELLS).reshape(-1, 3), rng.normal(0.0, 4.0, (3000, 3))])
+    by_view = hull.distance_by_view(points)
+    told = np.sort(np.nan_to_num(by_view, nan=np.inf), axis=1)[:, misses].astype(np.float64)
+    told[np.isfinite(by_view).sum(axis=1) < 6] = -np.inf
+    assert 0.03 < np.isinf(told).mean() < 0.9
+    found = hull.distance(points)
+    assert found == pytest.approx(told, rel=1e-5, abs=1e-6)
+    assert hull.distance(points[::-1])[::-1].tobytes() == found.tobytes()
+
+
 def test_any_number_of_threads_gives_the_same_bytes() -> None:
     views = around(6)
     silhouettes = [silhouette_of(view, ball()) for view in views]

@@ -26,7 +26,7 @@ Codes = NDArray[np.uint64]
 STEPS = 64.0
 # Two bilinear readings of distances may differ by this much more than their places: each is a mean of distances at
 # up to 0.71 pixels. And what a distance may be wrong, of outlines told to a fraction of a pixel.
-_SLACK = 2.0
+SLACK = 2.0
 # half a side of a box in pixels below which it is looked at pixel by pixel
 _SMALL = 3.0
 # what a view says of a cell; PARTLY: it does not see all of it, and shows inside what it sees
@@ -115,7 +115,7 @@ def side_of_box(
 
 
 @numba.njit(cache=True, nogil=True)
-def _plain_box(row: Array, x: float, y: float, z: float, half: float) -> tuple[int, float, float, float, float, float]:
+def plain_box(row: Array, x: float, y: float, z: float, half: float) -> tuple[int, float, float, float, float, float]:
     """What bounds the picture of a cell by a lens that changes nothing: UNDECIDED or UNSEEN, the picture of its middle,
     half widths and radius in pixels; where a point is off by a step of half a side along axis j the pixel moves by
     (row 0 - u row 2)_j / depth, of the depth where it is."""
@@ -144,7 +144,7 @@ def _plain_box(row: Array, x: float, y: float, z: float, half: float) -> tuple[i
 
 
 @numba.njit(cache=True, nogil=True)
-def _lens_box(
+def lens_box(
     row: Array, bounds: Array, x: float, y: float, z: float, half: float
 ) -> tuple[int, float, float, float, float, float]:
     """The same by any lens, from the angle that the cell fills: its corners are in the cone, so all of it is."""
@@ -183,9 +183,9 @@ def judge(fields: Fields, view: int, x: float, y: float, z: float, half: float) 
     height, width = size[0], size[1]
     is_plain = bounds[0] == 0.0
     if is_plain:
-        what, u, v, wide, high, radius = _plain_box(row, x, y, z, half)
+        what, u, v, wide, high, radius = plain_box(row, x, y, z, half)
     else:
-        what, u, v, wide, high, radius = _lens_box(row, bounds, x, y, z, half)
+        what, u, v, wide, high, radius = lens_box(row, bounds, x, y, z, half)
     if what != INSIDE:
         return what
     u0, u1, v0, v1 = u - wide, u + wide, v - high, v + high
@@ -201,18 +201,18 @@ def judge(fields: Fields, view: int, x: float, y: float, z: float, half: float) 
             return UNSEEN
     if known >= 0:
         k = reading(fields.known, known, height, width, u, v)
-        if k < -radius - _SLACK:
+        if k < -radius - SLACK:
             return UNSEEN
-        if k <= radius + _SLACK and is_whole:
+        if k <= radius + SLACK and is_whole:
             side = side_of_box(fields.known, known, size, u0, u1, v0, v1)
             if side == OUTSIDE:
                 return UNSEEN
             is_whole = side == INSIDE
-    if d > radius + _SLACK:
+    if d > radius + SLACK:
         return INSIDE if is_whole else PARTLY
     if not is_whole:
         return UNDECIDED
-    if d < -radius - _SLACK:
+    if d < -radius - SLACK:
         return OUTSIDE
     if max(wide, high) > _SMALL:
         return UNDECIDED
@@ -275,101 +275,3 @@ def split(
     counts[1] += filled
     left = Cells(codes[:kept].copy(), ends[:kept].copy(), views[:used].copy(), seen[:kept].copy(), missed[:kept].copy())
     return left, full[:filled].copy()
-
-
-@numba.njit(cache=True, nogil=True)
-def _lens_distance(fields: Fields, view: int, a: float, b: float, c: float) -> tuple[float, float, float]:
-    """Pixel of a point in the camera's frame by any lens, and what a pixel is there."""
-    u, v = lens.project(fields.rows[view, 12:], a, b, c)
-    return u, v, math.sqrt(a * a + b * b + c * c) / float(fields.lenses[view, 0])
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def view_distance(fields: Fields, view: int, x: float, y: float, z: float) -> float:
-    """Signed distance of a point to the cone of a silhouette, units of the world; NaN where the view does not tell."""
-    rows, height, width = fields.rows, fields.sizes[view, 0], fields.sizes[view, 1]
-    a = rows[view, 0] * x + rows[view, 1] * y + rows[view, 2] * z + rows[view, 3]
-    b = rows[view, 4] * x + rows[view, 5] * y + rows[view, 6] * z + rows[view, 7]
-    c = rows[view, 8] * x + rows[view, 9] * y + rows[view, 10] * z + rows[view, 11]
-    if fields.lenses[view, 0] > 0.0:
-        u, v, pixel = _lens_distance(fields, view, a, b, c)
-    else:
-        if c <= 0.0:
-            return math.nan
-        p, q, fx, fy = a / c, b / c, rows[view, 12], rows[view, 13]
-        u, v, pixel = fx * p + rows[view, 14], fy * q + rows[view, 15], 0.0
-    if not (u >= 0.0 and v >= 0.0 and u <= width and v <= height):
-        return math.nan
-    start = fields.known_starts[view]
-    if start >= 0 and not reading(fields.known, start, height, width, u, v) > 0.0:
-        return math.nan
-    d = reading(fields.distance, fields.starts[view], height, width, u, v)
-    if pixel == 0.0:
-        # the mean size of a pixel: squared singular values of the derivative of pixels by places sum up to this
-        total = 0.0
-        for j in range(3):
-            s, t = fx * (rows[view, j] - p * rows[view, 8 + j]), fy * (rows[view, 4 + j] - q * rows[view, 8 + j])
-            total += s * s + t * t
-        pixel = c / math.sqrt(0.5 * total)
-    return d * pixel
-
-
-@numba.njit(cache=True, nogil=True)
-def hull_distances(
-    fields: Fields, xyz: Array, min_views: int, misses: int, out: Array, owners: NDArray[np.int32]
-) -> None:
-    """Signed distances (N,) of points (N, 3) to the hull into ``out``, and the views that they are from, or -1, into
-    ``owners``. View by view, so that what is read of a picture is near to what was read before."""
-    best = np.full((xyz.shape[0], misses + 1), math.inf)
-    whose = np.full((xyz.shape[0], misses + 1), -1, np.int32)
-    seen = np.zeros(xyz.shape[0], np.int32)
-    for view in range(fields.rows.shape[0]):
-        for i in range(xyz.shape[0]):
-            d = view_distance(fields, view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            if math.isnan(d):
-                continue
-            seen[i] += 1
-            k = misses
-            if d >= best[i, k]:
-                continue
-            while k > 0 and best[i, k - 1] > d:
-                best[i, k], whose[i, k] = best[i, k - 1], whose[i, k - 1]
-                k -= 1
-            best[i, k], whose[i, k] = d, view
-    for i in range(xyz.shape[0]):
-        out[i] = -math.inf if seen[i] < min_views else best[i, misses]
-        owners[i] = whose[i, misses]
-
-
-@numba.njit(cache=True, nogil=True)
-def view_distances(fields: Fields, xyz: Array, out: NDArray[np.float32]) -> None:
-    """Signed distances of points (N, 3) to the cone of each view's silhouette into ``out`` (N, V), NaN where a view
-    does not tell."""
-    for view in range(fields.rows.shape[0]):
-        for i in range(xyz.shape[0]):
-            out[i, view] = view_distance(fields, view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-
-
-@numba.njit(cache=True, nogil=True)
-def cone_slopes(fields: Fields, xyz: Array, owners: NDArray[np.int32], step: float, out: NDArray[np.float32]) -> None:
-    """Outward unit normals (N, 3) at points (N, 3) of the cones of their views into ``out``, zero where there is
-    none."""
-    slope, at = np.empty(3), np.empty(3)
-    for i in range(xyz.shape[0]):
-        total = 0.0
-        for axis in range(3):
-            slope[axis] = 0.0
-            if owners[i] < 0:
-                continue
-            for k in range(3):
-                at[k] = xyz[i, k]
-            at[axis] = xyz[i, axis] + step
-            ahead = view_distance(fields, owners[i], at[0], at[1], at[2])
-            at[axis] = xyz[i, axis] - step
-            behind = view_distance(fields, owners[i], at[0], at[1], at[2])
-            if not (math.isnan(ahead) or math.isnan(behind)):
-                slope[axis] = behind - ahead
-            total += slope[axis] ** 2
-        norm = math.sqrt(total)
-        for axis in range(3):
-            out[i, axis] = slope[axis] / norm if norm > 0.0 else 0.0

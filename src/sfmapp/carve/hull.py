@@ -13,7 +13,9 @@ from scipy.ndimage import distance_transform_edt
 
 from sfmapp.camera import lens
 from sfmapp.camera.camera import pixels_to_rays
-from sfmapp.carve.carving_kernels import STEPS, Fields, cone_slopes, hull_distances, view_distances
+from sfmapp.carve.carving_kernels import STEPS, Fields
+from sfmapp.carve.hull_kernels import cone_slopes, hull_distances, view_distances
+from sfmapp.carve.octree import codes_in_box
 from sfmapp.carve.parts import in_parts
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 _SAMPLES, _BETWEEN = 64, 1.1
 # points for a thread at a time: few enough that neighbours are read together
 _CHUNK = 1 << 13
+# points that are asked about together, and bits of their places along each axis by which they are put together
+_TOGETHER, _BITS = 64, 10
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,22 @@ class Hull:
         """Distances (N,) of points (N, 3), and the views, as in ``fields``, that they are from."""
         points = np.ascontiguousarray(xyz, np.float64)
         out, owners = np.empty(len(points)), np.empty(len(points), np.int32)
+        order = _near_together(points)
 
         def run(a: int, b: int) -> None:
-            hull_distances(self.fields, points[a:b], self.min_views, self.misses, out[a:b], owners[a:b])
+            hull_distances(self.fields, points, order[a:b], _TOGETHER, self.min_views, self.misses, out, owners)
 
         _in_parts(run, len(points), threads)
         return out, owners
+
+
+def _near_together(points: Array) -> NDArray[np.int64]:
+    """The order (N,) of points (N, 3) in which those that follow each other are near."""
+    if not len(points):
+        return np.empty(0, np.int64)
+    codes = np.empty(len(points), np.uint64)
+    codes_in_box(points, _BITS, codes)
+    return np.argsort(codes, kind="stable")
 
 
 def _in_parts(run: Callable[[int, int], None], num: int, threads: int | None) -> None:

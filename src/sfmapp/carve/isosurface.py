@@ -8,14 +8,15 @@ cut so that the inside is apart; Nielson and Hamann, 1991).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
+from sfmapp.carve.octree import Codes, Octree, codes_of, gather_bits, places_of
 from sfmapp.events import Events
 from sfmapp.scene.mesh import Mesh, vertex_normals
 
@@ -37,10 +38,14 @@ _EDGES = [(corner, axis) for axis in range(3) for corner in range(8) if not corn
 _APART = 0.02
 # distances are cut off at so many cells: a jump at the border of a picture must not draw a vertex to the far side
 _REACH = 2.0
+# cells that are looked at together, and vertices whose normals are asked for together
+_CELLS, _POINTS = 1 << 17, 1 << 19
 
 
 def surface_of(tree: Octree, distance: Distance, normals: Normals | None = None, events: Events | None = None) -> Mesh:
     """The closed surface of an octree, where a signed distance is zero.
+
+    Cells are walked twice in slabs of layers, and what is kept of them is little more than the mesh itself.
 
     Args:
         tree: cells beyond those of its surface are looked at only where the distance changes its sign at their border,
@@ -52,36 +57,55 @@ def surface_of(tree: Octree, distance: Distance, normals: Normals | None = None,
         A mesh whose edges have two triangles each, anticlockwise as seen from outside, in grey.
     """
     events = events or Events()
-    events.started(STAGE, f"{len(tree.surface)} cells at the surface", total=2)
-    places = _places_in_layers(np.concatenate([tree.surface, _cells_at_faces(tree)]))
-    num, cell = 2**tree.depth, tree.cell
-    values = np.empty(0, np.float32)
+    codes = _distinct(np.concatenate([tree.surface, _cells_at_faces(tree)]))
     while True:
-        corners, lattice = _number_corners(places, num)
-        values = np.clip(distance(tree.low + cell * lattice), -_REACH * cell, _REACH * cell).astype(np.float32)
-        values[((lattice == 0) | (lattice == num)).any(axis=1)] = -np.float32(cell)
-        missing = _missing_cells(places, corners, lattice, values)
+        places = _places_in_layers(codes, 2**tree.depth)
+        values, around, num_faces = _look_at_corners(tree, places, distance, events)
+        missing = _missing_cells(tree, codes, places, around)
         if not len(missing):
             break
-        places = _places_in_layers(np.concatenate([codes_of(places), missing]))
-    events.advanced(STAGE)
-    vertex_of_edge, xyz = _vertices(corners, lattice, values)
-    faces = _triangles(corners, values, vertex_of_edge, *_table())
-    points = tree.low + cell * xyz
+        codes = _distinct(np.concatenate([codes, missing]))
+    num_vertices = int(np.count_nonzero(around))
+    del codes, around
+    points, faces = _mesh_of_cells(tree, places, values, num_vertices, num_faces)
+    del places, values
     found = vertex_normals(points, faces)
-    if normals is not None and len(points):
-        told = normals(points)
-        # a cone that is seen from within at a crease has no say
-        agrees = (told * found).sum(axis=1) > 0.0
-        found = np.where(agrees[:, None], told, found)
+    if normals is not None:
+        for first in range(0, len(points), _POINTS):
+            own = found[first : first + _POINTS]
+            told = normals(points[first : first + _POINTS])
+            # a cone that is seen from within at a crease has no say
+            agrees = (told * own).sum(axis=1) > 0.0
+            own[agrees] = told[agrees]
     events.finished(STAGE, f"{len(faces)} triangles")
     return Mesh(points, faces, found, np.full((len(points), 3), GREY, np.uint8))
 
 
-def _places_in_layers(codes: Codes) -> Places:
-    """Places (N, 3) of cells without doubles, by z and, within a layer, by code."""
-    places = places_of(np.unique(codes)).astype(np.int32)
-    return places[np.argsort(places[:, 2], kind="stable")]
+def _distinct(codes: Codes) -> Codes:
+    """Codes (N,) in ascending order, each once."""
+    codes = np.sort(codes)
+    return codes[np.concatenate([[True], codes[1:] != codes[:-1]])] if len(codes) else codes
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_layers(codes: Codes, ends: Ids, places: Places) -> None:
+    """Places (N, 3) of cells by z and, within a layer, by code; ``ends`` (n + 1,): noughts."""
+    for code in codes:
+        ends[gather_bits(code >> np.uint64(2)) + np.uint64(1)] += 1
+    for z in range(1, ends.shape[0]):
+        ends[z] += ends[z - 1]
+    for code in codes:
+        layer = gather_bits(code >> np.uint64(2))
+        at = ends[layer]
+        places[at, 0], places[at, 1], places[at, 2] = gather_bits(code), gather_bits(code >> np.uint64(1)), layer
+        ends[layer] += 1
+
+
+def _places_in_layers(codes: Codes, num: int) -> Places:
+    """Places (N, 3) of cells, ``num`` along each side, whose codes ascend: by z and, within a layer, by code."""
+    places = np.empty((len(codes), 3), np.int32)
+    _by_layers(codes, np.zeros(num + 1, np.int32), places)
+    return places
 
 
 def _cells_at_faces(tree: Octree) -> Codes:
@@ -100,20 +124,50 @@ def _cells_at_faces(tree: Octree) -> Codes:
     return np.concatenate(found)
 
 
-def _number_corners(places: Places, num: int) -> tuple[Ids, Places]:
-    """Corners (N, 8) of cells as numbers, and the places (M, 3) of these, in the order in which they are met."""
-    corners = np.empty((len(places), 8), np.int32)
-    lattice = np.empty((8 * len(places), 3), np.int32)
+class _Slab(NamedTuple):
+    """Cells of some layers.
+
+    Attributes:
+        places: (N, 3). corners: (N, 8) their numbers, in the order in which corners are met.
+        first: number of the first that no cell before has. lattice: (M, 3) places of those from there on.
+    """
+
+    places: Places
+    corners: Ids
+    first: int
+    lattice: Places
+
+
+def _slabs(places: Places, num: int) -> Iterator[_Slab]:
+    """Cells (N, 3) in layers, so many of these together that their number is worth a call."""
     planes = np.full((2, num + 1, num + 1), -1, np.int32)
-    total = _sweep(places, planes, corners, lattice)
-    return corners, lattice[:total].copy()
+    begin, first = 0, 0
+    while begin < len(places):
+        last = places[min(begin + _CELLS, len(places)) - 1, 2]
+        end = int(np.searchsorted(places[:, 2], last, side="right"))
+        corners = np.empty((end - begin, 8), np.int32)
+        lattice = np.empty((8 * len(corners), 3), np.int32)
+        met = _sweep(places, begin, end, planes, corners, first, lattice)
+        yield _Slab(places[begin:end], corners, first, lattice[: met - first])
+        begin, first = end, met
 
 
 @numba.njit(cache=True, nogil=True)
-def _sweep(places: Places, planes: NDArray[np.int32], corners: Ids, lattice: Places) -> int:
-    """Fill corners and places for cells in layers, with a map of two planes of corners; how many there are."""
-    num, total, before, begin = places.shape[0], 0, 0, 0
-    while begin < num:
+def _forget(planes: NDArray[np.int32], z: int, places: Places, begin: int, end: int) -> None:
+    """Take the corners of cells out of the plane of corners at a height."""
+    for i in range(begin, end):
+        for k in range(4):
+            planes[z & 1, places[i, 1] + (k >> 1), places[i, 0] + (k & 1)] = -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _sweep(
+    places: Places, start: int, stop: int, planes: NDArray[np.int32], corners: Ids, first: int, lattice: Places
+) -> int:
+    """Fill corners and places for the layers of some cells, with a map of two planes of corners in which those of the
+    layer before are still there; how many corners there are with them."""
+    num, total, begin = places.shape[0], first, start
+    while begin < stop:
         z, end = places[begin, 2], begin
         while end < num and places[end, 2] == z:
             end += 1
@@ -124,123 +178,144 @@ def _sweep(places: Places, planes: NDArray[np.int32], corners: Ids, lattice: Pla
                 if at < 0:
                     at = total
                     planes[(z + up) & 1, y, x] = at
-                    lattice[at, 0], lattice[at, 1], lattice[at, 2] = x, y, z + up
+                    lattice[at - first, 0], lattice[at - first, 1], lattice[at - first, 2] = x, y, z + up
                     total += 1
-                corners[i, k] = at
+                corners[i - start, k] = at
         # the lower plane, met by this layer and by the one below, is taken for the plane above the next layer
-        follows = end < num and places[end, 2] == z + 1
-        for i in range(before, end):
-            for k in range(4):
-                planes[z & 1, places[i, 1] + (k >> 1), places[i, 0] + (k & 1)] = -1
-                if not follows and i >= begin:
-                    planes[(z + 1) & 1, places[i, 1] + (k >> 1), places[i, 0] + (k & 1)] = -1
-        before, begin = (begin if follows else end), end
+        before = begin
+        while before > 0 and places[before - 1, 2] == z - 1:
+            before -= 1
+        _forget(planes, z, places, before, end)
+        if not (end < num and places[end, 2] == z + 1):
+            _forget(planes, z + 1, places, begin, end)
+        begin = end
     return total
 
 
-@numba.njit(cache=True, nogil=True)
-def _count_cells(corners: Ids, values: NDArray[np.float32], cells: NDArray[np.int8]) -> None:
-    """Add up for each edge (M, 3), by its first corner and its axis, the cells around it if its sign changes."""
-    for i in range(corners.shape[0]):
-        for axis in range(3):
-            for k in range(8):
-                if not k >> axis & 1:
-                    a, b = corners[i, k], corners[i, k | 1 << axis]
-                    if (values[a] > 0.0) != (values[b] > 0.0):
-                        cells[a, axis] += 1
-
-
-def _missing_cells(places: Places, corners: Ids, lattice: Places, values: NDArray[np.float32]) -> Codes:
-    """Codes of cells beside those at hand that have an edge on which the sign changes."""
-    cells = np.zeros((len(lattice), 3), np.int8)
-    _count_cells(corners, values, cells)
-    first, axis = np.nonzero((cells > 0) & (cells < 4))
-    if not len(first):
-        return np.empty(0, np.uint64)
-    found = []
-    for a in range(3):
-        at = lattice[first[axis == a]]
-        for i in (0, 1):
-            for j in (0, 1):
-                found.append(codes_of(at - np.insert([i, j], a, 0)))
-    return np.setdiff1d(np.concatenate(found), codes_of(places))
+def _look_at_corners(
+    tree: Octree, places: Places, distance: Distance, events: Events
+) -> tuple[NDArray[np.float32], NDArray[np.int8], int]:
+    """Distances (M,) at the corners of cells; how many of these cells are around each edge (M, 3), by its first corner
+    and its axis, where the sign changes, nought where it does not; and the number of triangles."""
+    num, cell, total = 2**tree.depth, tree.cell, 0
+    # of most cells half of the corners are another's: what is not touched takes no memory
+    values, around = np.empty(8 * len(places), np.float32), np.zeros((8 * len(places), 3), np.int8)
+    first = _table()[0]
+    events.started(STAGE, f"{len(places)} cells at the surface", total=len(places))
+    end = 0
+    for slab in _slabs(places, num):
+        found = np.clip(distance(tree.low + cell * slab.lattice), -_REACH * cell, _REACH * cell).astype(np.float32)
+        found[((slab.lattice == 0) | (slab.lattice == num)).any(axis=1)] = -np.float32(cell)
+        end = slab.first + len(found)
+        values[slab.first : end] = found
+        total += _count_cells(slab.corners, values, around, first)
+        events.advanced(STAGE, len(slab.places))
+        events.raise_if_cancelled()
+    return values[:end], around[:end], total
 
 
 @numba.njit(cache=True, nogil=True)
-def _number_edges(corners: Ids, lattice: Places, values: NDArray[np.float32], edges: Ids, xyz: Array) -> int:
-    """Number edges (M, 3) on which the sign changes, in the order in which cells meet them, with the place on each."""
-    total = 0
-    for i in range(corners.shape[0]):
-        for axis in range(3):
-            for k in range(8):
-                if k >> axis & 1:
-                    continue
-                a, b = corners[i, k], corners[i, k | 1 << axis]
-                if (values[a] > 0.0) == (values[b] > 0.0) or edges[a, axis] >= 0:
-                    continue
-                edges[a, axis] = total
-                share = min(max(values[a] / (values[a] - values[b]), _APART), 1.0 - _APART)
-                for j in range(3):
-                    xyz[total, j] = lattice[a, j]
-                xyz[total, axis] += share
-                total += 1
-    return total
-
-
-def _vertices(corners: Ids, lattice: Places, values: NDArray[np.float32]) -> tuple[Ids, Array]:
-    """The vertex on each edge (M, 3), -1 where none is, and their places (V, 3) in cells."""
-    edges = np.full((len(lattice), 3), -1, np.int32)
-    xyz = np.empty((3 * len(lattice), 3))
-    total = _number_edges(corners, lattice, values, edges, xyz)
-    return edges, xyz[:total].copy()
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill_triangles(
-    corners: Ids,
-    values: NDArray[np.float32],
-    edges: Ids,
-    first: Ids,
-    triangles: NDArray[np.int8],
-    ends: NDArray[np.int8],
-    faces: Ids,
-) -> int:
-    """Triangles of all cells into ``faces`` unless that is empty; how many there are."""
+def _count_cells(corners: Ids, values: NDArray[np.float32], around: NDArray[np.int8], first: Ids) -> int:
+    """Add up for each edge the cells around it if its sign changes; the number of triangles in the cells."""
     total = 0
     for i in range(corners.shape[0]):
         case = 0
         for k in range(8):
             case |= (values[corners[i, k]] > 0.0) << k
-        for t in range(first[case], first[case + 1]):
-            if faces.shape[0]:
-                for j in range(3):
-                    edge = triangles[t, j]
-                    faces[total, j] = edges[corners[i, ends[edge, 0]], ends[edge, 1]]
-            total += 1
+        total += first[case + 1] - first[case]
+        for axis in range(3):
+            for k in range(8):
+                if not k >> axis & 1 and (case >> k & 1) != (case >> (k | 1 << axis) & 1):
+                    around[corners[i, k], axis] += 1
     return total
 
 
-def _triangles(corners: Ids, values: NDArray[np.float32], edges: Ids, first: Ids, triangles: NDArray[np.int8]) -> Ids:
-    ends = np.array(_EDGES, np.int8)
-    faces = np.empty((0, 3), np.int32)
-    faces = np.empty((_fill_triangles(corners, values, edges, first, triangles, ends, faces), 3), np.int32)
-    if len(faces):
-        _fill_triangles(corners, values, edges, first, triangles, ends, faces)
-    return faces
+def _missing_cells(tree: Octree, codes: Codes, places: Places, around: NDArray[np.int8]) -> Codes:
+    """Codes of cells beside those at hand that have an edge on which the sign changes."""
+    if not ((around > 0) & (around < 4)).any():
+        return np.empty(0, np.uint64)
+    found = []
+    for slab in _slabs(places, 2**tree.depth):
+        part = around[slab.first : slab.first + len(slab.lattice)]
+        first, axis = np.nonzero((part > 0) & (part < 4))
+        for a in range(3):
+            at = slab.lattice[first[axis == a]]
+            found += [codes_of(at - np.insert([i, j], a, 0)) for i in (0, 1) for j in (0, 1)]
+    wanted = _distinct(np.concatenate(found))
+    at_hand = codes[np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)]
+    return np.asarray(wanted[at_hand != wanted])
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(
+    places: Places, corners: Ids, values: NDArray[np.float32], edges: Ids, table: Table, xyz: Array, faces: Ids,
+    num_vertices: int, num_faces: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Number edges (M, 3) on which the sign changes, in the order in which cells meet them, with the place on each in
+    cells, and the triangles between them; how many vertices and triangles there are with those of cells before."""
+    for i in range(corners.shape[0]):
+        case = 0
+        for k in range(8):
+            case |= (values[corners[i, k]] > 0.0) << k
+        for axis in range(3):
+            for k in range(8):
+                if k >> axis & 1 or (case >> k & 1) == (case >> (k | 1 << axis) & 1):
+                    continue
+                a, b = corners[i, k], corners[i, k | 1 << axis]
+                if edges[a, axis] >= 0:
+                    continue
+                edges[a, axis] = num_vertices
+                share = min(max(values[a] / (values[a] - values[b]), _APART), 1.0 - _APART)
+                for j in range(3):
+                    xyz[num_vertices, j] = places[i, j] + (k >> j & 1)
+                xyz[num_vertices, axis] += share
+                num_vertices += 1
+        for t in range(table.first[case], table.first[case + 1]):
+            for j in range(3):
+                edge = table.triangles[t, j]
+                faces[num_faces, j] = edges[corners[i, table.ends[edge, 0]], table.ends[edge, 1]]
+            num_faces += 1
+    return num_vertices, num_faces
+
+
+def _mesh_of_cells(
+    tree: Octree, places: Places, values: NDArray[np.float32], num_vertices: int, num_faces: int
+) -> tuple[Array, Ids]:
+    """Vertices (V, 3), world, and triangles (F, 3) of cells with distances (M,) at their corners."""
+    edges = np.full((len(values), 3), -1, np.int32)
+    xyz, faces = np.empty((num_vertices, 3)), np.empty((num_faces, 3), np.int32)
+    done = 0, 0
+    for slab in _slabs(places, 2**tree.depth):
+        done = _fill(slab.places, slab.corners, values, edges, _table(), xyz, faces, *done)
+    xyz *= tree.cell
+    xyz += tree.low
+    return xyz, faces
 
 
 # --------------------------------------------------------------------------------- how a cell is cut, in all 256 cases
 
 
+class Table(NamedTuple):
+    """For each case, bit k for corner k inside, the triangles of its cell.
+
+    Attributes:
+        first: (257,) of each case in ``triangles`` (T, 3), which are edges.
+        ends: (12, 2) first corner and axis of each edge.
+    """
+
+    first: Ids
+    triangles: NDArray[np.int8]
+    ends: NDArray[np.int8]
+
+
 @cache
-def _table() -> tuple[Ids, NDArray[np.int8]]:
-    """For each case, bit k for corner k inside, the triangles of its cell: ``first`` (257,) in edges (T, 3)."""
+def _table() -> Table:
     first, triangles = [0], []
     for case in range(256):
         for loop in _loops(case):
             triangles += _cut_loop(loop)
         first.append(len(triangles))
-    return np.array(first, np.int32), np.array(triangles, np.int8).reshape(-1, 3)
+    return Table(np.array(first, np.int32), np.array(triangles, np.int8).reshape(-1, 3), np.array(_EDGES, np.int8))
 
 
 def _edge_between(a: int, b: int) -> int:

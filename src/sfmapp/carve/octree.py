@@ -98,6 +98,25 @@ def _places(codes: Codes, out: NDArray[np.int64]) -> None:
             out[i, axis] = np.int64(gather_bits(codes[i] >> np.uint64(axis)))
 
 
+@numba.njit(cache=True, nogil=True)
+def codes_in_box(xyz: Array, bits: int, out: Codes) -> None:
+    """Codes (N,) of points (N, 3) in cells of the cube around them, 2**bits along its side; points that are no numbers
+    are in the first."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for i in range(xyz.shape[0]):
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], xyz[i, axis]), max(high[axis], xyz[i, axis])
+    side = max(high[0] - low[0], high[1] - low[1], high[2] - low[2])
+    scale = ((1 << bits) - 1) / side if 0.0 < side < np.inf else 0.0
+    for i in range(xyz.shape[0]):
+        code = np.uint64(0)
+        for axis in range(3):
+            at = (xyz[i, axis] - low[axis]) * scale
+            if at > 0.0:
+                code |= spread_bits(np.uint64(at)) << np.uint64(axis)
+        out[i] = code
+
+
 def codes_of(places: NDArray[np.integer]) -> Codes:
     """Codes (N,) of cells at places (N, 3), counted from 0 along each axis."""
     out = np.empty(len(places), np.uint64)

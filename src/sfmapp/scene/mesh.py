@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,12 +50,25 @@ def flat_areas(xy: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[n
     return np.asarray(0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]))
 
 
+@numba.njit(cache=True, nogil=True)
+def _add_normals(xyz: NDArray[np.float64], faces: NDArray[np.int32], total: NDArray[np.float64]) -> None:
+    """Add the normals of triangles, as long as their areas, to those of their corners (N, 3)."""
+    for face in range(faces.shape[0]):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ux, uy, uz = xyz[b, 0] - xyz[a, 0], xyz[b, 1] - xyz[a, 1], xyz[b, 2] - xyz[a, 2]
+        vx, vy, vz = xyz[c, 0] - xyz[a, 0], xyz[c, 1] - xyz[a, 1], xyz[c, 2] - xyz[a, 2]
+        x, y, z = 0.5 * (uy * vz - uz * vy), 0.5 * (uz * vx - ux * vz), 0.5 * (ux * vy - uy * vx)
+        for corner in (a, b, c):
+            total[corner, 0] += x
+            total[corner, 1] += y
+            total[corner, 2] += z
+
+
 def vertex_normals(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float32]:
     """(N, 3) unit normals of vertices: those of their faces, weighted by area; z where a vertex has no face."""
-    vectors = face_vectors(xyz, faces)
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(vectors[:, axis], 3), len(xyz)) for axis in range(3)], axis=1
-    )
+    total = np.zeros((len(xyz), 3))
+    _add_normals(np.ascontiguousarray(xyz, np.float64), np.ascontiguousarray(faces, np.int32), total)
     length = np.linalg.norm(total, axis=1)
     total[length == 0.0] = 0.0, 0.0, 1.0
-    return np.asarray(total / np.where(length == 0.0, 1.0, length)[:, None], np.float32)
+    total /= np.where(length == 0.0, 1.0, length)[:, None]
+    return total.astype(np.float32)
