@@ -5,14 +5,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.rendering import overlap, show_mesh
+from sfmapp.carve.parts import in_parts
+from sfmapp.carve.rendering import Shown, overlap, show_mesh
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.views import View, project_point
+from sfmapp.carve.views import View
 from sfmapp.events import Events
 from sfmapp.reporting import Report
 from sfmapp.scene.mesh import Mesh
@@ -89,6 +92,7 @@ class ColoringReport(Report):
 def color_surface(
     mesh: Mesh, cell: float, views: Sequence[View], silhouettes: Sequence[Silhouette],
     read: Callable[[int], Pixels], events: Events | None = None, *, threads: int = 1,
+    also: Callable[[int, NDArray[np.float32]], None] | None = None,
 ) -> tuple[Pixels, ColoringReport]:  # fmt: skip
     """The colour of each vertex of a mesh: the mean of the views in which it is not hidden, weighted by the fourth
     power of the cosine under which they see it over their distance.
@@ -100,53 +104,57 @@ def color_surface(
         read: gives the photograph (H, W, 3) of a view.
         events: progress and cancellation.
         threads: views at a time; the result does not depend on it.
+        also: called with each view, one after another, and the depths (H, W) that it shows of the mesh.
 
     Returns:
         (N, 3) uint8, and the report, with the overlap of each silhouette and the mesh.
     """
     events = events or Events()
     events.started(STAGE, f"colours of {len(mesh.xyz)} vertices", total=len(views))
-    total, weight = np.zeros((len(mesh.xyz), 3)), np.zeros(len(mesh.xyz))
-    count = np.zeros(len(mesh.xyz), np.int32)
-    normal = np.ascontiguousarray(mesh.normal, np.float64)
+    xyz, normal = np.ascontiguousarray(mesh.xyz), np.ascontiguousarray(mesh.normal)
+    sums, fits = _no_colors(len(xyz)), list[ViewFit]()
+    compared = np.arange(0, len(xyz), max(1, len(xyz) // _COMPARED))
+    samples = np.zeros((len(views), len(compared), 4), np.float32)
 
-    def work(v: int) -> tuple[Array, ViewFit]:
-        view, silhouette = views[v], silhouettes[v]
-        depth = show_mesh(view, mesh.xyz, mesh.faces).depth
-        iou, over, under = overlap(depth, silhouette)
-        seen = np.zeros((len(mesh.xyz), 4))
-        _look(view.row, view.center, mesh.xyz, normal, depth, read(v), silhouette.distance, cell, seen)
-        fit = ViewFit(
-            name=view.name, iou=iou, over_px=over, under_px=under,
-            under_share=under / max(int(silhouette.inside.sum()), 1), source=silhouette.source,
-        )  # fmt: skip
-        return seen, fit
+    def show(v: int) -> tuple[Shown, Pixels]:
+        return show_mesh(views[v], xyz, mesh.faces), read(v)
 
-    compared = slice(None, None, max(1, len(mesh.xyz) // _COMPARED))
-    samples = np.zeros((len(views), len(mesh.xyz[compared]), 4), np.float32)
-    fits: list[ViewFit] = []
     with ThreadPoolExecutor(threads) as pool:
         # so many at a time, as each holds an array of all vertices
         for first in range(0, len(views), threads):
-            for seen, fit in pool.map(work, range(first, min(first + threads, len(views)))):
-                samples[len(fits)] = seen[compared]
-                total += seen[:, :3] * seen[:, 3:]
-                weight += seen[:, 3]
-                count += seen[:, 3] > 0.0
-                fits.append(fit)
+            some = range(first, min(first + threads, len(views)))
+            for v, (shown, rgb) in zip(some, pool.map(show, some), strict=True):
+                view, silhouette = views[v], silhouettes[v]
+                look = _Look(view.center, shown.corners, shown.depth, rgb, silhouette.distance)
+                in_parts(partial(_add_colors, look, xyz, normal, cell, sums), len(xyz), pool)
+                few, told = look._replace(corners=shown.corners[compared]), _no_colors(len(compared))
+                _add_colors(few, xyz[compared], normal[compared], cell, told, 0, len(compared))
+                samples[v, :, :3] = told.color / np.where(told.weight > 0.0, told.weight, 1.0)[:, None]
+                samples[v, :, 3] = told.weight
+                fits.append(_fit(view, silhouette, shown))
+                if also is not None:
+                    also(v, shown.depth)
                 events.advanced(STAGE)
             events.raise_if_cancelled()
-    is_seen = weight > 0.0
+    is_seen = sums.weight > 0.0
     report = ColoringReport(
         seen_share=float(is_seen.mean()) if len(is_seen) else 0.0,
-        median_views=float(np.median(count)) if len(count) else 0.0, views=fits,
-        differences=_differences(mesh.xyz[compared], np.array([view.center for view in views]), samples),
+        median_views=float(np.median(sums.num_views)) if len(xyz) else 0.0, views=fits,
+        differences=_differences(xyz[compared], np.array([view.center for view in views]), samples),
     )  # fmt: skip
     events.finished(STAGE, f"{report.seen_share:.1%} of the vertices seen")
-    rgb = np.full((len(mesh.xyz), 3), float(_GREY))
-    rgb[is_seen] = total[is_seen] / weight[is_seen, None]
-    _fill(mesh.xyz, rgb, is_seen)
-    return np.rint(rgb).astype(np.uint8), report
+    mixed = np.full((len(xyz), 3), float(_GREY))
+    mixed[is_seen] = sums.color[is_seen] / sums.weight[is_seen, None]
+    _fill(xyz, mixed, is_seen)
+    return np.rint(mixed).astype(np.uint8), report
+
+
+def _fit(view: View, silhouette: Silhouette, shown: Shown) -> ViewFit:
+    iou, over, under = overlap(shown.depth, silhouette)
+    return ViewFit(
+        name=view.name, iou=iou, over_px=over, under_px=under,
+        under_share=under / max(int(silhouette.inside.sum()), 1), source=silhouette.source,
+    )  # fmt: skip
 
 
 def _differences(xyz: Array, centers: Array, samples: NDArray[np.float32]) -> list[Difference]:
@@ -178,21 +186,55 @@ def _fill(xyz: Array, rgb: Array, is_seen: NDArray[np.bool_]) -> None:
     rgb[~is_seen] = rgb[is_seen][nearest].mean(axis=1)
 
 
+class _Look(NamedTuple):
+    """What a view shows: its place (3,), pixels and depths of vertices (N, 3), the depth in each pixel (H, W), its
+    colour (H, W, 3), and how far that is inside the silhouette."""
+
+    center: Array
+    corners: Array
+    depth: NDArray[np.float32]
+    rgb: Pixels
+    distance: NDArray[np.float32]
+
+
+class _Sums(NamedTuple):
+    """Of vertices (N): colours times weights (N, 3), weights, and how many views show each."""
+
+    color: Array
+    weight: Array
+    num_views: NDArray[np.int32]
+
+
+def _no_colors(num: int) -> _Sums:
+    return _Sums(np.zeros((num, 3)), np.zeros(num), np.zeros(num, np.int32))
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _between(rgb: Pixels, line: int, col: int, channel: int, fu: float, fv: float) -> float:
+    """A channel between the centres of four pixels."""
+    above = (1.0 - fu) * rgb[line, col, channel] + fu * rgb[line, col + 1, channel]
+    below = (1.0 - fu) * rgb[line + 1, col, channel] + fu * rgb[line + 1, col + 1, channel]
+    return float((1.0 - fv) * above + fv * below)
+
+
 @numba.njit(cache=True, nogil=True)
-def _look(
-    row: Array, center: Array, xyz: Array, normal: Array, depth: NDArray[np.float32], rgb: Pixels,
-    distance: NDArray[np.float32], cell: float, out: Array,
-) -> None:  # fmt: skip
-    """Colours and weights (N, 4) of the vertices that a view shows; zeros of the others."""
+def _add_colors(
+    look: _Look, xyz: Array, normal: NDArray[np.float32], cell: float, sums: _Sums, first: int, last: int
+) -> None:
+    """Add what a view shows of some of the vertices."""
+    center, corners, depth, rgb, distance = look.center, look.corners, look.depth, look.rgb, look.distance
+    color, weights, num_views = sums.color, sums.weight, sums.num_views
     height, width = depth.shape
-    for n in range(xyz.shape[0]):
-        x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        dx, dy, dz = center[0] - x, center[1] - y, center[2] - z
+    for n in range(first, last):
+        dx, dy, dz = center[0] - xyz[n, 0], center[1] - xyz[n, 1], center[2] - xyz[n, 2]
+        along = float(normal[n, 0]) * dx + float(normal[n, 1]) * dy + float(normal[n, 2]) * dz
+        if along <= 0.0:
+            continue
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        cosine = (normal[n, 0] * dx + normal[n, 1] * dy + normal[n, 2] * dz) / max(length, 1e-300)
+        cosine = along / max(length, 1e-300)
         if cosine < _SMALLEST_COSINE:
             continue
-        u, v, ahead = project_point(row, x, y, z)
+        u, v, ahead = corners[n, 0], corners[n, 1], corners[n, 2]
         if not (ahead > 0.0 and 0.5 <= u <= width - 0.5 and 0.5 <= v <= height - 0.5):
             continue
         col, line = min(int(u - 0.5), width - 2), min(int(v - 0.5), height - 2)
@@ -205,8 +247,8 @@ def _look(
             (1.0 - fu) * distance[line + 1, col] + fu * distance[line + 1, col + 1]
         )
         share = min(max(clear / _CLEAR_PX, 0.01), 1.0) if clear == clear else 1.0
-        for c in range(3):
-            above = (1.0 - fu) * rgb[line, col, c] + fu * rgb[line, col + 1, c]
-            below = (1.0 - fu) * rgb[line + 1, col, c] + fu * rgb[line + 1, col + 1, c]
-            out[n, c] = (1.0 - fv) * above + fv * below
-        out[n, 3] = share * (cosine * cell / length) ** _SHARPNESS
+        weight = share * (cosine * cell / length) ** _SHARPNESS
+        for channel in range(3):
+            color[n, channel] += weight * _between(rgb, line, col, channel, fu, fv)
+        weights[n] += weight
+        num_views[n] += 1

@@ -8,10 +8,11 @@ squared distance over the solid angle; a rough surface may have any area, so the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +20,9 @@ from sfmapp.carve.joined import Evidence, cast_votes
 from sfmapp.carve.joined_kernels import BINS
 from sfmapp.carve.rendering import show_mesh
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.views import View, project_points
+from sfmapp.carve.views import View, project_point, project_points
 from sfmapp.reporting import Report
-from sfmapp.scene.mesh import Mesh, face_areas, face_vectors
+from sfmapp.scene.mesh import Mesh, face_areas
 from sfmapp.surface.trim import pieces
 
 Array = NDArray[np.float64]
@@ -38,6 +39,8 @@ _SMALLEST_COSINE = 0.2
 _HIDDEN_EDGES = 2.0
 # outlines are believed within so many of their sigmas
 _SIGMAS = 3.0
+# views that are asked for the least area, of a surface that they were not looked at with before
+_NUM_ASKED = 24
 # directions that are tried for the next photograph, spread evenly over the sphere
 _NUM_TRIED = 96
 # unseen places are listed from this share of the whole surface on
@@ -97,14 +100,12 @@ class Known:
     Attributes:
         kind: (F,) ``UNSEEN``, ``CLOSURE``, ``OUTLINES`` or ``PATCHES``.
         centers, normals: (F, 3), world. areas: (F,).
-        num_seeing: (F,) photographs that see it.
     """
 
     kind: NDArray[np.int8]
     centers: Array
     normals: Array
     areas: Array
-    num_seeing: NDArray[np.int32]
 
     def of_vertices(self, mesh: Mesh) -> NDArray[np.uint8]:
         """(N,) what is known of the vertices of the mesh: the least of what is known of their triangles."""
@@ -113,9 +114,69 @@ class Known:
         return found
 
 
+class SeenFaces:
+    """Which triangles (F) of a closed mesh photographs see from in front, unhidden, one photograph after another.
+
+    Attributes:
+        centers, normals: (F, 3), world. areas: (F,). edge: that of a typical triangle, units of the world.
+        is_seen: (F,) by any so far.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        num = len(mesh.faces)
+        self.centers, self.normals, self.areas = np.empty((num, 3)), np.empty((num, 3)), np.empty(num)
+        _lay_out(np.ascontiguousarray(mesh.xyz), mesh.faces, self.centers, self.normals, self.areas)
+        self.edge = float(np.sqrt(np.median(self.areas)) * 1.5)
+        self.is_seen = np.zeros(num, np.bool_)
+
+    def add(self, view: View, depth: NDArray[np.float32]) -> None:
+        """A photograph more, and the depths (H, W) that it shows of the mesh."""
+        _mark_seen(view.row, view.center, self.centers, self.normals, depth, _HIDDEN_EDGES * self.edge, self.is_seen)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lay_out(xyz: Array, faces: NDArray[np.int32], centers: Array, normals: Array, areas: Array) -> None:
+    """Middles (F, 3), unit normals and areas (F,) of triangles."""
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for k in range(3):
+            centers[f, k] = (xyz[a, k] + xyz[b, k] + xyz[c, k]) / 3.0
+        total = 0.0
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            normals[f, k] = 0.5 * (
+                (xyz[b, i] - xyz[a, i]) * (xyz[c, j] - xyz[a, j]) - (xyz[b, j] - xyz[a, j]) * (xyz[c, i] - xyz[a, i])
+            )
+            total += normals[f, k] ** 2
+        areas[f] = math.sqrt(total)
+        for k in range(3):
+            normals[f, k] /= max(areas[f], 1e-300)
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_seen(
+    row: Array, center: Array, centers: Array, normals: Array, depth: NDArray[np.float32], hidden: float,
+    is_seen: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Mark triangles that a view shows from in front, no farther behind what it shows than ``hidden``."""
+    height, width = depth.shape
+    for f in range(centers.shape[0]):
+        if is_seen[f]:
+            continue
+        x, y, z = centers[f, 0], centers[f, 1], centers[f, 2]
+        dx, dy, dz = center[0] - x, center[1] - y, center[2] - z
+        along = dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2]
+        if along <= _SMALLEST_COSINE * math.sqrt(dx * dx + dy * dy + dz * dz):
+            continue
+        u, v, ahead = project_point(row, x, y, z)
+        if ahead > 0.0 and u >= 0.0 and v >= 0.0 and u < width and v < height:
+            is_seen[f] = ahead <= depth[int(v), int(u)] + np.float32(hidden)
+
+
 def find_known(
-    mesh: Mesh, views: Sequence[View], evidence: Evidence | None = None, band: float = 0.0, *, threads: int = 1
-) -> Known:
+    mesh: Mesh, views: Sequence[View], evidence: Evidence | None = None, band: float = 0.0, *,
+    threads: int = 1, seen: SeenFaces | None = None,
+) -> Known:  # fmt: skip
     """Who vouches for each triangle.
 
     Args:
@@ -124,24 +185,20 @@ def find_known(
         evidence: of a surface that is not the whole hull's: what is not on the hull is not told by outlines; None:
             these tell all of it.
         band: within which a patch of the evidence vouches, units of the world.
-        threads: views at a time; the result does not depend on it.
+        threads: that ask the hull; the result does not depend on it.
+        seen: by all views; None: they are asked here.
     """
-    vectors = face_vectors(mesh.xyz, mesh.faces)
-    areas = np.linalg.norm(vectors, axis=1)
-    normals = vectors / np.maximum(areas, 1e-300)[:, None]
-    centers = np.ascontiguousarray(mesh.xyz[mesh.faces].mean(axis=1))
-    edge = float(np.sqrt(np.median(areas)) * 1.5)
-    seeing = np.zeros(len(areas), np.int32)
-    with ThreadPoolExecutor(threads) as pool:
-        for sees in pool.map(lambda view: _sees(view, mesh, centers, normals, edge), views):
-            seeing += sees
-    kind = np.full(len(areas), OUTLINES, np.int8)
+    if seen is None:
+        seen = SeenFaces(mesh)
+        for view in views:
+            seen.add(view, show_mesh(view, mesh.xyz, mesh.faces).depth)
+    kind = np.full(len(mesh.faces), OUTLINES, np.int8)
     if evidence is not None:
-        kind[np.abs(evidence.hull.distance(centers, threads)) > _ON_HULL_EDGES * edge] = CLOSURE
-    kind[seeing == 0] = UNSEEN
+        kind[np.abs(evidence.hull.distance(seen.centers, threads)) > _ON_HULL_EDGES * seen.edge] = CLOSURE
+    kind[~seen.is_seen] = UNSEEN
     if evidence is not None:
-        kind[_beside_patches(centers, evidence, band)] = PATCHES
-    return Known(kind, centers, normals, areas, seeing)
+        kind[_beside_patches(seen.centers, evidence, band)] = PATCHES
+    return Known(kind, seen.centers, seen.normals, seen.areas)
 
 
 def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[np.bool_]:
@@ -151,29 +208,16 @@ def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[
     return np.asarray((votes[:, 1 : BINS - 1] > 0).any(axis=1))
 
 
-def _sees(view: View, mesh: Mesh, centers: Array, normals: Array, edge: float) -> NDArray[np.bool_]:
-    """Which triangles (F,) a view shows from in front, unhidden."""
-    shown = show_mesh(view, mesh.xyz, mesh.faces)
-    seen = np.empty((len(centers), 3))
-    project_points(view.row, centers, seen)
-    toward = view.center - centers
-    away = np.linalg.norm(toward, axis=1)
-    in_front = (toward * normals).sum(axis=1) > _SMALLEST_COSINE * away
-    inside = (seen[:, :2] >= 0.0).all(axis=1) & (seen[:, 0] < view.width) & (seen[:, 1] < view.height)
-    found = in_front & inside & (seen[:, 2] > 0.0)
-    u, v = seen[found, 0].astype(int), seen[found, 1].astype(int)
-    found[found] = seen[found, 2] <= shown.depth[v, u] + _HIDDEN_EDGES * edge
-    return np.asarray(found)
-
-
 def find_limits(
-    mesh: Mesh, hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette], known: Known
-) -> LimitsReport:
+    mesh: Mesh, hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette], known: Known,
+    area_low: float | None = None,
+) -> LimitsReport:  # fmt: skip
     """What is not known of a surface.
 
     Args:
         mesh: the surface, of which ``known`` tells. hull_mesh: that of the hull, which may be the same.
         views, silhouettes: one of each for a photograph.
+        area_low: the most that :func:`area_shown` gives for the hull; None: it is asked here.
     """
     total = float(known.areas.sum())
     shares = [float(known.areas[known.kind == kind].sum()) / total for kind in range(len(KINDS))]
@@ -181,7 +225,8 @@ def find_limits(
         unseen_share=shares[UNSEEN], closure_share=shares[CLOSURE], outlines_share=shares[OUTLINES],
         patches_share=shares[PATCHES],
         hollows=_hollows(mesh, known), next_views=_next_views(mesh, views, known),
-        volume_high=_volume_high(hull_mesh, views, silhouettes), area_low=_area_low(hull_mesh, views, silhouettes),
+        volume_high=_volume_high(hull_mesh, views, silhouettes),
+        area_low=_area_low(hull_mesh, views, silhouettes) if area_low is None else area_low,
     )  # fmt: skip
 
 
@@ -256,22 +301,25 @@ def _volume_high(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[S
 
 
 def _area_low(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:
-    """The largest over the views of twice the integral of squared distance over solid angle, three sigmas inside."""
-    best = 0.0
-    for view, silhouette in zip(views, silhouettes, strict=True):
-        if view.camera is None:  # angles of a matrix that may not be decomposed are not known
-            continue
-        shown = show_mesh(view, hull_mesh.xyz, hull_mesh.faces).depth
-        sure = silhouette.distance > _SIGMAS * silhouette.outline_sigma_px + 0.5
-        if silhouette.known is not None:
-            sure &= silhouette.known
-        v, u = np.nonzero(sure & np.isfinite(shown))
-        if not len(u):
-            continue
-        # r^2 dOmega of a pixel on a plane at depth z is z^2 / (fx fy) times the cosine to the axis
-        fx, fy, cx, cy = view.camera.k_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-        x, y = (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy
-        cosine = 1.0 / np.sqrt(1.0 + x**2 + y**2)
-        depth = shown[v, u].astype(np.float64)
-        best = max(best, 2.0 * float((depth**2 * cosine).sum() / (fx * fy)))
-    return best
+    """The largest that some views give, evenly spread from the first to the last: of more it is hardly larger."""
+    asked = np.unique(np.linspace(0, len(views) - 1, min(_NUM_ASKED, len(views))).round().astype(int)).tolist()
+    return max(
+        area_shown(views[v], silhouettes[v], show_mesh(views[v], hull_mesh.xyz, hull_mesh.faces).depth) for v in asked
+    )
+
+
+def area_shown(view: View, silhouette: Silhouette, depth: NDArray[np.float32]) -> float:
+    """What the object's area is at least by one view, square units of the world, 0 where it does not tell: twice the
+    integral of squared distance over solid angle, three sigmas inside the outline; ``depth``: (H, W) of the hull."""
+    if view.camera is None:  # angles of a matrix that may not be decomposed are not known
+        return 0.0
+    sure = silhouette.distance > _SIGMAS * silhouette.outline_sigma_px + 0.5
+    if silhouette.known is not None:
+        sure &= silhouette.known
+    v, u = np.nonzero(sure & np.isfinite(depth))
+    # r^2 dOmega of a pixel on a plane at depth z is z^2 / (fx fy) times the cosine to the axis
+    fx, fy, cx, cy = view.camera.k_matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    x, y = (u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy
+    cosine = 1.0 / np.sqrt(1.0 + x**2 + y**2)
+    away = depth[v, u].astype(np.float64)
+    return 2.0 * float((away**2 * cosine).sum() / (fx * fy))

@@ -21,10 +21,12 @@ class Shown:
     Attributes:
         depth: (H, W) of the nearest triangle behind each pixel's centre, units of the world; inf for none.
         face: (H, W) int32 that triangle; -1 for none.
+        corners: (N, 3) pixel and depth of each place between which there are triangles; NaN where the lens has none.
     """
 
     depth: NDArray[np.float32]
     face: NDArray[np.int32]
+    corners: Array
 
 
 def show_mesh(view: View, xyz: Array, faces: NDArray[np.int32]) -> Shown:
@@ -38,7 +40,7 @@ def show_mesh(view: View, xyz: Array, faces: NDArray[np.int32]) -> Shown:
     depth = np.full((view.height, view.width), np.inf, np.float32)
     face = np.full(depth.shape, -1, np.int32)
     _rasterize(seen, faces, depth, face)
-    return Shown(depth, face)
+    return Shown(depth, face, seen)
 
 
 def overlap(depth: NDArray[np.float32], silhouette: Silhouette) -> tuple[float, int, int]:

@@ -157,5 +157,11 @@ def project_point(row: Array, x: float, y: float, z: float) -> tuple[float, floa
 @numba.njit(cache=True, nogil=True)
 def project_points(row: Array, xyz: Array, out: Array) -> None:
     """Pixels and depths (N, 3) of world points (N, 3), see :func:`project_point`, into ``out``."""
+    optics = row[12:]  # a new view of it for each point costs as much as the point
     for i in range(xyz.shape[0]):
-        out[i, 0], out[i, 1], out[i, 2] = project_point(row, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        a = row[0] * x + row[1] * y + row[2] * z + row[3]
+        b = row[4] * x + row[5] * y + row[6] * z + row[7]
+        c = row[8] * x + row[9] * y + row[10] * z + row[11]
+        out[i, 0], out[i, 1] = lens.project(optics, a, b, c)
+        out[i, 2] = c

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from sfmapp.carve.box import Box, cameras_inside, find_box, user_box
 from sfmapp.carve.coloring import ColoringReport, color_surface
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence
-from sfmapp.carve.limits import Known, LimitsReport, find_known, find_limits
+from sfmapp.carve.limits import Known, LimitsReport, SeenFaces, area_shown, find_known, find_limits
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.tolerance import doubt_holes
@@ -126,9 +126,11 @@ def carve(
             with job.stage("tolerance"):
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches, by_colors=what.by_colors)
-        mesh, colors = _surface(job, source, silhouettes, solid)
+        mesh = _surface(job, solid)
+        with job.stage("colors"):
+            mesh, colors, looks = _colored(job, source, silhouettes, mesh, solid.octree.cell)
         with job.stage("limits"):
-            known, limits = _limits(job, source, silhouettes, box, solid, mesh)
+            known, limits = _limits(job, source, silhouettes, box, solid, looks)
         shown, texture = mesh, None
         if job.options.surface.texture:
             with job.stage("texture"):
@@ -149,21 +151,30 @@ def carve(
         return CarveResult(job.workspace.folder, report, solid.octree, mesh, evidence)
 
 
+@dataclass(frozen=True)
+class _Looks:
+    """What the photographs show of a surface: which triangles, and what its area is at least if it is the hull's."""
+
+    mesh: Mesh
+    seen: SeenFaces
+    area_low: float
+
+
 def _limits(
-    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box, solid: Solid, mesh: Mesh
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box, solid: Solid, looks: _Looks
 ) -> tuple[Known, LimitsReport | None]:  # fmt: skip
     """What is known of the surface, and what is not; the latter not of one that a user's box cuts off, for bounds are
     the whole hull's."""
-    joining = solid.joining
+    mesh, joining = looks.mesh, solid.joining
     evidence, band = (None, 0.0) if joining is None else (joining.evidence, joining.report.band)
     if evidence is None and solid.shadows is None and box.told_by == "user":  # its faces are told by nobody
         evidence = Evidence(source.views, silhouettes, solid.hull, ())
-    known = find_known(mesh, source.views, evidence, band, threads=job.threads)
+    known = find_known(mesh, source.views, evidence, band, threads=job.threads, seen=looks.seen)
     if box.told_by == "user":
         return known, None
-    hull_mesh = mesh
-    if joining is not None:
-        hull_mesh = surface_of(joining.hull_octree, lambda xyz: solid.hull.distance(xyz, job.threads))
+    if joining is None:
+        return known, find_limits(mesh, mesh, source.views, silhouettes, known, looks.area_low)
+    hull_mesh = surface_of(joining.hull_octree, lambda xyz: solid.hull.distance(xyz, job.threads))
     return known, find_limits(mesh, hull_mesh, source.views, silhouettes, known)
 
 
@@ -227,20 +238,30 @@ def _corner(at: Array) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in at) + ")"
 
 
-def _surface(
-    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], solid: Solid
-) -> tuple[Mesh, ColoringReport]:  # fmt: skip
-    """The surface in colours of the photographs, and where these are from."""
-    octree = solid.octree
+def _surface(job: Job, solid: Solid) -> Mesh:
+    """The surface, in grey."""
     with job.stage("surface"):
-        mesh = surface_of(octree, solid.distance, solid.normals, job.events)
+        mesh = surface_of(solid.octree, solid.distance, solid.normals, job.events)
         if not len(mesh.faces):
             raise NoReconstructionError(
                 "nothing is left of the volume at this resolution", "ask for more cells: --cells"
             )
-    with job.stage("colors"):
-        rgb, colors = color_surface(
-            mesh, octree.cell, source.views, silhouettes, lambda v: read_rgb(source.records[v]), job.events,
-            threads=job.threads,
-        )  # fmt: skip
-    return Mesh(mesh.xyz, mesh.faces, mesh.normal, rgb), colors
+        return mesh
+
+
+def _colored(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], mesh: Mesh, cell: float
+) -> tuple[Mesh, ColoringReport, _Looks]:  # fmt: skip
+    """The surface in colours of the photographs, where these are from, and what else they show."""
+    seen, areas = SeenFaces(mesh), [0.0]
+
+    def look(v: int, depth: NDArray[np.float32]) -> None:
+        seen.add(source.views[v], depth)
+        areas.append(area_shown(source.views[v], silhouettes[v], depth))
+
+    rgb, colors = color_surface(
+        mesh, cell, source.views, silhouettes, lambda v: read_rgb(source.records[v]), job.events, threads=job.threads,
+        also=look,
+    )  # fmt: skip
+    mesh = replace(mesh, rgb=rgb)
+    return mesh, colors, _Looks(mesh, seen, max(areas))
