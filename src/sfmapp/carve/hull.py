@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt
 
 from sfmapp.camera import lens
 from sfmapp.camera.camera import pixels_to_rays
@@ -125,6 +124,8 @@ def hull_of(
     Raises:
         InputError: their numbers or sizes differ, there is no view, or a distance is no number.
     """
+    from scipy.ndimage import distance_transform_edt  # 0.2 s, which every command would pay for carving's options
+
     if len(views) != len(silhouettes) or not views:
         raise InputError(f"expected a silhouette for each view, found {len(silhouettes)} for {len(views)} views")
     for view, silhouette in zip(views, silhouettes, strict=True):

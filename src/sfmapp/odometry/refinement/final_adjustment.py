@@ -31,6 +31,7 @@ from sfmapp.odometry.refinement.calibration_check import (
     Answer,
     adjust_poses,
     close_poses,
+    follow_with_poses,
     question_calibration,
 )
 from sfmapp.odometry.refinement.inertial_adjustment import adjust_with_imu
@@ -105,16 +106,15 @@ def adjust_finally(
     classify(model, job.num_elsewhere)
     events.raise_if_cancelled()
     sigma = residual_scale_px(model, MIN_SIGMA_PX)
-    adjustment = close_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
+    cost, found_before = follow_with_poses(model, sigma), None
     events.raise_if_cancelled()
-    found_before = None
     if given is not None and keyframes.rig is not given:
-        found_before, model = (model, 2 * adjustment.final_cost), _with_rig(model, given)
-        adjustment = close_poses(model, sigma, _MAX_STEPS, _TOLERANCE)
-    answer = _question(model, 2 * adjustment.final_cost, sigma, options, events, found_before)
+        found_before, model = (model, cost), _with_rig(model, given)
+        cost = follow_with_poses(model, sigma)
+    answer = _question(model, cost, sigma, options, events, found_before)
+    adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE)
     num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if answer.is_refined:
-        adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE)
         of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
     events.decided(STAGE, f"closing adjustment: {adjustment.text}", **adjustment)
     job.model = model = answer.model
