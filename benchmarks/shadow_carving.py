@@ -110,9 +110,9 @@ def shadows_of(scene: Scene, hull: Octree, seed: int) -> tuple[list[Shadow], lis
         lit, *under = (photograph(light, NOISE_GREY, [seed, i, k]) for k, light in enumerate(picture.light))
         photographs.append(LitPhotograph(lit, under, picture.cover == 1.0, scene.views[i], lamps, hull))
     names = [f"lamp {k + 1}" for k in range(len(scene.rig.lamps[0]))]
-    masks, brightness, reports = find_shadows(photographs, names, fan_deg=options.fan_deg, edge_deg=options.edge_deg)
+    fans, brightness, reports = find_shadows(photographs, names, fan_deg=options.fan_deg, edge_deg=options.edge_deg)
     shadows = [
-        Shadow(i, scene.rig.lamps[i][k], dark, names[k]) for i, row in enumerate(masks) for k, dark in enumerate(row)
+        Shadow(i, scene.rig.lamps[i][k], fan, names[k]) for i, row in enumerate(fans) for k, fan in enumerate(row)
     ]
     lights = [LampLight(i, scene.rig.lamps[i], most) for i, most in enumerate(brightness)]
     return shadows, lights, [dict(report) for report in reports]

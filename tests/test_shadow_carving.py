@@ -66,7 +66,7 @@ def views_of(rig: Rig) -> list[View]:
 
 def exact_shadows(rig: Rig, pictures: list[Rendering]) -> list[Shadow]:
     return [
-        Shadow(i, rig.lamps[i][k], (picture.cover == 1.0) & (light == 0.0))
+        Shadow(i, rig.lamps[i][k], np.where((picture.cover == 1.0) & (light == 0.0), 0.0, np.inf).astype(np.float32))
         for i, picture in enumerate(pictures)
         for k, light in enumerate(picture.light[1:])
     ]
@@ -134,10 +134,21 @@ def test_lights_far_from_the_camera_are_left_out() -> None:
     assert carved is hull
 
 
-def test_a_mask_of_another_size_is_named() -> None:
+def test_shadows_and_lamps_that_do_not_fit_the_views_are_named() -> None:
     _, views, shadows, hull, _ = scene("block")
-    with pytest.raises(InputError, match=r"160 x 120 pixels, found 10 x 20"):
-        carve_shadows(hull, views, [replace(shadows[0], dark=np.zeros((20, 10), np.bool_))], ShadowOptions())
+    light = LampLight(0, np.zeros((2, 3)), np.zeros((2, 120, 160), np.float32))
+    wrong: list[tuple[str, list[Shadow], list[LampLight]]] = [
+        (r"160 x 120 pixels, .*found shape \(20, 10\)", [replace(shadows[0], fan_deg=light.most[0, :20, :10])], []),
+        (r"place of a light, .* \(3,\), found shape \(2,\)", [replace(shadows[0], light=np.zeros(2))], []),
+        ("16 cameras under lights, found one of camera 16", [replace(shadows[0], view=16)], []),
+        ("16 cameras under lights, found one of camera -1", [], [replace(light, view=-1)]),
+        (r"places of 2 lamps, .* \(2, 3\), found shape \(2, 2\)", [], [replace(light, lamps=np.zeros((2, 2)))]),
+        (r"160 x 120 pixels under 2 lamps, .*found shape \(1, 120, 160\)", [], [replace(light, most=light.most[:1])]),
+        ("0: expected its lamps once, found them 2 times", [], [light, light]),
+    ]  # fmt: skip
+    for said, some, lights in wrong:
+        with pytest.raises(InputError, match=said):
+            carve_shadows(hull, views, some, ShadowOptions(), lights=lights)
 
 
 def test_a_tree_and_its_grid_are_one() -> None:
@@ -161,8 +172,8 @@ def photographed(
         view = view_of_camera("", rig.camera, pose)
         photographs.append(LitPhotograph(lit, under, picture.cover == 1.0, view, rig.lamps[i], hull))
     names = ["a", "b", "c", "d"][: len(rig.lamps[0])]
-    masks, brightness, reports = find_shadows(photographs, names, fan_deg=2.0, edge_deg=edge_deg)
-    shadows = [Shadow(i, rig.lamps[i][k], dark) for i, row in enumerate(masks) for k, dark in enumerate(row)]
+    fans, brightness, reports = find_shadows(photographs, names, fan_deg=2.0, edge_deg=edge_deg)
+    shadows = [Shadow(i, rig.lamps[i][k], fan) for i, row in enumerate(fans) for k, fan in enumerate(row)]
     return shadows, [LampLight(i, rig.lamps[i], most) for i, most in enumerate(brightness)], reports
 
 

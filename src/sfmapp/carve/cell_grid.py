@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,28 @@ def grid_of(tree: Octree) -> CellGrid:
             filled[x : x + side, y : y + side, z : z + side] = 1
     filled[tuple((lows[-1] - first).T)] = 1
     return CellGrid(tree, first, filled)
+
+
+def coarsened(grid: CellGrid, level: int) -> CellGrid:
+    """A volume in the cells of a level, no finer than its own, that have something of it."""
+    by = 1 << (grid.tree.depth - level)
+    first = grid.first // by
+    before = grid.first - first * by
+    after = -(before + grid.filled.shape) % by
+    padded = np.pad(grid.filled, list(zip(before, after, strict=True)))
+    x, y, z = (n // by for n in padded.shape)
+    filled = padded.reshape(x, by, y, by, z, by).max(axis=(1, 3, 5))
+    return CellGrid(replace(grid.tree, depth=level), first, filled)
+
+
+def intersect(grid: CellGrid, coarse: CellGrid) -> None:
+    """Take away from a volume what is empty in one that :func:`coarsened` made of it."""
+    by = 1 << (grid.tree.depth - coarse.tree.depth)
+    at = [
+        (first + np.arange(n)) // by - low
+        for first, n, low in zip(grid.first, grid.filled.shape, coarse.first, strict=True)
+    ]
+    grid.filled[coarse.filled[np.ix_(*at)] == 0] = 0
 
 
 def depth_under(before: CellGrid, after: CellGrid) -> Callable[[Array], Array]:

@@ -19,6 +19,8 @@ from sfmapp.carve.views import project_point
 
 Array = NDArray[np.float64]
 Map = NDArray[np.int32]
+# counts of pixels above and to the left of corners
+Sums = NDArray[np.int32]
 
 # columns that a held place may not be looked for in: nothing there may be taken away
 _LIT = -1
@@ -33,7 +35,8 @@ class Planes(NamedTuple):
         base: distance of the two.
         low: (3,) least angle about the line, at the camera, at the light.
         step: (3,) from one sample to the next. num: (3,) int64 samples of each.
-        spread: by how many samples at the light a shadow grows with each at the camera.
+        spread: (F,) by how many samples at the light a shadow grows with each at the camera, for each angle of the
+            fan, of which there are eight at most.
     """
 
     camera: Array
@@ -43,7 +46,7 @@ class Planes(NamedTuple):
     low: Array
     step: Array
     num: NDArray[np.int64]
-    spread: float
+    spread: Array
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -66,22 +69,22 @@ def angles_of_all(planes: Planes, xyz: Array, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _is_dark(planes: Planes, row: Array, reach: NDArray[np.float32], margin: float, about: float, at: float) -> bool:
-    """Whether all that the camera sees between a direction's neighbours is dark, and a margin of pixels beside it."""
+def _fan_of(planes: Planes, row: Array, lit: Sums, margin: float, about: float, at: float) -> int:
+    """Least fan for which all pixels are dark that what is nearer to a direction than to its neighbours may touch, by a
+    margin of pixels; as many as there are fans where none is."""
     u, v = _seen(planes, row, about, at)
-    height, width = reach.shape
-    if not (u >= 0.0 and v >= 0.0 and u < width and v < height):
-        return False
-    i, j = int(v), int(u)
-    if reach[i, j] <= 0.0:
-        return False
+    num, height, width = len(lit), lit.shape[1] - 1, lit.shape[2] - 1
     a, b = _seen(planes, row, about + planes.step[0], at)
     c, d = _seen(planes, row, about, at + planes.step[1])
-    # nothing between four samples is farther from the nearest than half the longer diagonal
-    half = 0.5 * max(math.hypot(a + c - 2.0 * u, b + d - 2.0 * v), math.hypot(a - c, b - d))
-    # a pixel reaches half its diagonal beyond its centre
-    free = float(reach[i, j]) - math.hypot(u - j - 0.5, v - i - 0.5)
-    return free > half + math.sqrt(0.5) + margin
+    across = 0.5 * (abs(a - u) + abs(c - u)) + margin
+    along = 0.5 * (abs(b - v) + abs(d - v)) + margin
+    if not (u >= across and v >= along and u + across < width and v + along < height):
+        return num
+    left, right, top, bottom = int(u - across), int(u + across) + 1, int(v - along), int(v + along) + 1
+    for f in range(num):
+        if lit[f, bottom, right] - lit[f, top, right] - lit[f, bottom, left] + lit[f, top, left] == 0:
+            return f
+    return num
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -99,24 +102,27 @@ def _seen(planes: Planes, row: Array, about: float, at: float) -> tuple[float, f
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_held(
-    planes: Planes, row: Array, reach: NDArray[np.float32], margin: float, low: Array, cell: float, filled: Cells,
-    first: Map,
-) -> None:  # fmt: skip
+    planes: Planes, row: Array, lit: Sums, margin: float, low: Array, cell: float, filled: Cells, first: Map
+) -> None:
     """How far from the camera each direction is free of what may be there.
 
     What a lit pixel shows is held, all along its ray, and so is what lies behind a held place as seen from the camera
-    or from the light, as far as the volume reaches.
+    or from the light, as far as the volume reaches; for a direction whose pixel is dark from some fan on, as seen from
+    all of that fan.
 
     Args:
         planes: of camera and light. row: (29,) of the view.
-        reach: (H, W) pixels from each pixel's centre to the nearest one that is not dark. margin: pixels.
+        lit: (F, H + 1, W + 1) for each fan, narrow ones first, how many pixels above and to the left of the corners of
+            pixels are not dark. margin: pixels.
         low, cell, filled: the window of cells: corner (3,), side, (X, Y, Z).
         first: (A, C) int32 filled for each angle about the line and at the camera: the first sample at the light that
             is held, as many as there are samples where none is, -1 where the direction is not dark.
     """
-    num_about, num_camera, num_light = planes.num[0], planes.num[1], planes.num[2]
-    shaded = np.empty(num_light, np.bool_)
-    dark = np.empty(num_camera, np.bool_)
+    num_about, num_camera, num_light, num_fans = planes.num[0], planes.num[1], planes.num[2], lit.shape[0]
+    # a bit for each fan
+    shaded = np.empty(num_light, np.uint8)
+    fans = np.empty(num_camera, np.int64)
+    spread = np.empty(num_fans)
     # tangents of angles at the light, of which the places on a ray follow
     cotangents = np.empty(num_light)
     for k in range(num_light):
@@ -125,29 +131,31 @@ def find_held(
         about = planes.low[0] + i * planes.step[0]
         last = -1
         for j in range(num_camera):
-            dark[j] = _is_dark(planes, row, reach, margin, about, planes.low[1] + j * planes.step[1])
+            fans[j] = _fan_of(planes, row, lit, margin, about, planes.low[1] + j * planes.step[1])
             first[i, j] = _LIT
-            if dark[j]:
+            if fans[j] < num_fans:
                 last = j
-        shaded[:] = False
-        spread = 0.0
+        shaded[:] = 0
+        spread[:] = 0.0
         # nearest to the light first
         for j in range(last + 1):
             _hold_on_ray(planes, about, planes.low[1] + j * planes.step[1], cotangents, low, cell, filled, shaded,
-                         not dark[j], first[i], j)  # fmt: skip
-            spread += planes.spread
-            while spread >= 1.0:
-                for k in range(num_light - 1):
-                    shaded[k] |= shaded[k + 1]
-                spread -= 1.0
+                         fans[j] if fans[j] < num_fans else -1, first[i], j)  # fmt: skip
+            for f in range(num_fans):
+                spread[f] += planes.spread[f]
+                while spread[f] >= 1.0:
+                    for k in range(num_light - 1):
+                        shaded[k] |= shaded[k + 1] & np.uint8(1 << f)
+                    spread[f] -= 1.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _hold_on_ray(
     planes: Planes, about: float, at: float, cotangents: Array, low: Array, cell: float, filled: Cells,
-    shaded: NDArray[np.bool_], is_held: bool, first: Map, j: int,
+    shaded: Cells, fan: int, first: Map, j: int,
 ) -> None:  # fmt: skip
-    """One direction from the camera, from near to far: whether a sample is held, and shades what lies behind it."""
+    """One direction from the camera, from near to far: whether a sample is held, and shades what lies behind it. Held
+    from the beginning if no fan, -1, is dark."""
     a, c = planes.axes, planes.camera
     p, q = math.cos(about), math.sin(about)
     # in cells from the window's corner: direction along the line, and across
@@ -158,6 +166,8 @@ def _hold_on_ray(
     ox, oy, oz = (c[0] - low[0]) / cell, (c[1] - low[1]) / cell, (c[2] - low[2]) / cell
     cotangent = 1.0 / math.tan(at)
     nx, ny, nz = filled.shape
+    is_held = fan < 0
+    bit = np.uint8(0) if is_held else np.uint8(1 << fan)
     if not is_held:
         first[j] = shaded.shape[0]
     for k in range(shaded.shape[0]):
@@ -170,32 +180,60 @@ def _hold_on_ray(
         x, y, z = ox + along * ax + across * px, oy + along * ay + across * py, oz + along * az + across * pz
         if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz) or filled[int(x), int(y), int(z)] == 0:
             continue
-        if shaded[k] and not is_held:
+        if not is_held and shaded[k] & bit:
             is_held = True
             first[j] = k
         if is_held:
-            shaded[k] = True
+            shaded[k] = 255
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def take_free(
-    planes: Planes, row: Array, reach: NDArray[np.float32], low: Array, cell: float, filled: Cells, first: Map,
-    out: Cells,
-) -> None:  # fmt: skip
-    """Mark with 1 in ``out`` (X, Y, Z) the filled cells that are free wherever the planes pass through them."""
-    height, width = reach.shape
-    for i in range(filled.shape[0]):
+def find_dark(
+    row: Array, is_dark: NDArray[np.bool_], low: Array, cell: float, filled: Cells, begin: int, end: int,
+    places: NDArray[np.int32], pixels: NDArray[np.int32],
+) -> int:  # fmt: skip
+    """The filled cells of slices of a window whose middles are seen in a mask; how many these are.
+
+    Args:
+        row: (29,) of the view. is_dark: (H, W).
+        low, cell, filled: the window. begin, end: its slices across x.
+        places, pixels: (N, 3) and (N, 2) filled with the cells and their rows and columns.
+    """
+    height, width = is_dark.shape
+    count = 0
+    for i in range(begin, end):
         for j in range(filled.shape[1]):
             for k in range(filled.shape[2]):
                 if filled[i, j, k] == 0:
                     continue
-                x, y, z = low[0] + (i + 0.5) * cell, low[1] + (j + 0.5) * cell, low[2] + (k + 0.5) * cell
-                # most are seen where nothing is dark, which is quickly told
-                u, v, depth = project_point(row, x, y, z)
+                u, v, depth = project_point(
+                    row, low[0] + (i + 0.5) * cell, low[1] + (j + 0.5) * cell, low[2] + (k + 0.5) * cell
+                )
                 if not (depth > 0.0 and u >= 0.0 and v >= 0.0 and u < width and v < height):
                     continue
-                if reach[int(v), int(u)] > 0.0 and _is_free(planes, first, x, y, z, cell):
-                    out[i, j, k] = 1
+                if is_dark[int(v), int(u)]:
+                    places[count, 0], places[count, 1], places[count, 2] = i, j, k
+                    pixels[count, 0], pixels[count, 1] = int(v), int(u)
+                    count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def take_free(
+    planes: Planes, is_dark: NDArray[np.bool_], low: Array, cell: float, places: NDArray[np.int32],
+    pixels: NDArray[np.int32], first: Map, out: Cells,
+) -> None:  # fmt: skip
+    """Mark with 1 in ``out`` (X, Y, Z) those of some cells that are free wherever the planes pass through them.
+
+    ``is_dark`` is the mask (H, W) of the widest fan, ``places`` and ``pixels`` are those of :func:`find_dark`.
+    """
+    for n in range(places.shape[0]):
+        i, j, k = places[n]
+        if not is_dark[pixels[n, 0], pixels[n, 1]] or out[i, j, k] == 1:
+            continue
+        x, y, z = low[0] + (i + 0.5) * cell, low[1] + (j + 0.5) * cell, low[2] + (k + 0.5) * cell
+        if _is_free(planes, first, x, y, z, cell):
+            out[i, j, k] = 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

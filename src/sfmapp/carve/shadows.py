@@ -3,7 +3,8 @@
 Both show the same pixels of the same surface, so their quotient is free of its colour: ``g (n l) / (n c)`` where the
 light l falls, n being the surface's normal, c the camera's direction, g the quotient of the lights' powers; 0 in the
 shadow. What leans towards the light enough for :mod:`sfmapp.carve.shadow_carving` to tell is brighter than
-``g sin(fan) / sin(angle + fan)``. Dark is what stays below a share of that, whatever noise has done to both pictures.
+``g sin(fan) / sin(angle + fan)``. Dark is what stays below a share of that, whatever noise has done to both pictures;
+the darker a shadow is, the narrower is the fan for which it does.
 
 A surface that is turned away from the light is as dark as one in the shadow of another, but of an edge between one that
 only the camera sees and one that only the light falls on it says nothing. Where light and camera are farther apart than
@@ -31,6 +32,7 @@ from sfmapp.reporting import Report
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Most = NDArray[np.float32]
+Fans = NDArray[np.float32]
 Array = NDArray[np.float64]
 Levels = NDArray[np.float64]
 
@@ -99,8 +101,8 @@ class LitPhotograph:
 
 def find_shadows(
     photographs: Sequence[LitPhotograph], names: Sequence[str], *, fan_deg: float, edge_deg: float
-) -> tuple[list[list[Mask]], list[Most], list[DetectionReport]]:
-    """Pixels that are certainly in shadow.
+) -> tuple[list[list[Fans]], list[Most], list[DetectionReport]]:
+    """How certainly pixels are in shadow.
 
     Args:
         photographs: of one camera from different places, each under the same lights, exposed alike; grey values are
@@ -109,8 +111,8 @@ def find_shadows(
         fan_deg, edge_deg: as in :class:`~sfmapp.carve.shadow_carving.ShadowOptions`.
 
     Returns:
-        for each photograph a mask (H, W) for each light; for each (L, H, W) as in
-        :class:`~sfmapp.carve.lamp_mixtures.LampLight`; and a report for each light.
+        for each photograph and light fans (H, W) as in :class:`~sfmapp.carve.shadow_carving.Shadow`; for each
+        photograph (L, H, W) as in :class:`~sfmapp.carve.lamp_mixtures.LampLight`; and a report for each light.
     """
     num = len(names)
     sigmas = [noise_of([p.under[k] for p in photographs]) for k in range(num)]
@@ -119,22 +121,23 @@ def find_shadows(
     # made twice, as those of all photographs together would take much memory
     told = lamp_gains((_quotients(photograph) for photograph in photographs), np.maximum(gains, 1e-6))
     counts = np.zeros((num, 5))
-    masks: list[list[Mask]] = []
+    fans: list[list[Fans]] = []
     lights: list[Most] = []
     for photograph in photographs:
         inside, angles, quotients = photograph.inside, photograph.angles_deg, _quotients(photograph)
         least = linear(_mean(photograph.lit) - _CERTAIN / 3.0 * sigma_lit)
         mirrors = _mirrors(photograph) & inside
-        masks.append([])
+        fans.append([])
         lights.append(np.full((num, *inside.shape), np.inf, np.float32))
         for k, (sigma, gain) in enumerate(zip(sigmas, gains, strict=True)):
-            limit = _SHARE * gain * least * quotient_of_lean(angles[k], fan_deg)
+            full = _SHARE * gain * least
+            limit = full * quotient_of_lean(angles[k], fan_deg)
             # what no light at all may look like
             too_dark = inside & (limit <= linear(np.array(_CERTAIN / 3.0 * sigma)))
-            shown = np.maximum(
-                linear(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma),
-                linear(_grey(photograph.under[k]) + _PIXEL * sigma),
-            )
+            grey = _grey(photograph.under[k])
+            shown = np.maximum(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma, grey + _PIXEL * sigma)
+            # beside a lit place, what is dark is so by itself
+            shown = linear(np.minimum(shown, grey + _CERTAIN * sigma))
             seen = (shown < limit) & inside & ~too_dark & ~mirrors
             # nothing by lamps whose power is not known
             usable = inside & ~mirrors & (told[k] * least > 0.0)
@@ -142,7 +145,8 @@ def find_shadows(
             # a pixel beside may show what the middle of a cell does not
             lights[-1][k] = maximum_filter(most, 3)
             dark = seen if angles[k] <= edge_deg else leans_towards(quotients, told, k, seen)
-            masks[-1].append(dark)
+            fan = fan_of_quotient(shown / np.where(dark, full, 1.0), angles[k])
+            fans[-1].append(np.where(dark, fan, np.inf).astype(np.float32))
             counts[k] += [mask.sum() for mask in (inside, dark, seen & ~dark, too_dark, mirrors)]
     shares = counts[:, 1:] / np.maximum(counts[:, :1], 1.0)
     reports = [
@@ -150,7 +154,7 @@ def find_shadows(
                         too_dark_share=float(row[2]), mirror_share=float(row[3]))
         for name, gain, sigma, row in zip(names, gains, sigmas, shares, strict=True)
     ]  # fmt: skip
-    return masks, lights, reports
+    return fans, lights, reports
 
 
 def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
@@ -175,6 +179,12 @@ def quotient_of_lean(angle: float, fan: float) -> float:
     """Least ``(n l) / (n c)`` of a surface that is seen from the camera, and from ``fan`` degrees beyond a light at
     ``angle`` degrees from it."""
     return float(np.sin(np.radians(fan)) / np.sin(np.radians(angle + fan)))
+
+
+def fan_of_quotient(quotient: Levels, angle: float) -> Levels:
+    """Inverse of :func:`quotient_of_lean`: fans, degrees, of least quotients."""
+    a = np.radians(angle)
+    return np.asarray(np.degrees(np.arctan2(quotient * np.sin(a), 1.0 - quotient * np.cos(a))))
 
 
 def linear(grey: Levels) -> Levels:

@@ -70,13 +70,13 @@ def carve_by_lights(
         photographs.append(LitPhotograph(pictures[0], pictures[1:], inside, view, at, octree))
         places.append(at)
     options = ShadowOptions() if file.sharpest_edge_deg is None else ShadowOptions(edge_deg=file.sharpest_edge_deg)
-    masks, brightness, lamps = find_shadows(
+    fans, brightness, lamps = find_shadows(
         photographs, [light.name for light in lights], fan_deg=options.fan_deg, edge_deg=options.edge_deg
     )
     for doubt in doubts_of(lamps):
         events.warned("shadows", doubt)
     shadows = [
-        Shadow(v, places[n][k], dark, lights[k].name) for n, v in enumerate(chosen) for k, dark in enumerate(masks[n])
+        Shadow(v, places[n][k], fan, lights[k].name) for n, v in enumerate(chosen) for k, fan in enumerate(fans[n])
     ]
     mixed = [LampLight(v, np.array(places[n]), brightness[n]) for n, v in enumerate(chosen)]
     carved, report = carve_shadows(
