@@ -618,6 +618,17 @@ def promises(folder: Path) -> Iterator[Promise]:
     live = [[row["ate_live_mm"] for row in pair] for pair in both if all("ate_live_mm" in row for row in pair)]
     text = "poses given out live drift less with an IMU than without"
     yield Promise("inertial", text, sum(b < a for a, b in live), len(live), report["date"][:10])
+    report = read(folder, "live")
+    live = [run for run in report["runs"] if "live" in run]
+    text = "a frame that a busy machine has no time for is counted: tracked and dropped ones are those that came"
+    counted = [run["live"]["num_tracked"] + run["live"]["num_dropped"] == run["num_played"] for run in live]
+    yield Promise("live", text, sum(counted), len(counted), report["date"][:10])
+    text = "live, whatever the load: 95 % of the poses are known within 0.25 s"
+    young = [run["live"]["latency_ms"]["p95"] < 250.0 for run in live]
+    yield Promise("live", text, sum(young), len(young), report["date"][:10])
+    text = "live, the last third of a run holds at most 20 MB more than the second"
+    flat = [run["memory_mb"][2] - run["memory_mb"][1] <= 20.0 for run in live]
+    yield Promise("live", text, sum(flat), len(flat), report["date"][:10])
     report = read(folder, "wheeled")
     pairs = [(run["free"], run[motion]) for run in report["runs"] for motion in ("planar", "ackermann")]
     text = "on wheels planar motion gives no fewer frames a pose than free motion"

@@ -8,16 +8,11 @@ camera_info. Poses of the camera in the world go to the topic pose, in an arbitr
 adjusted once more and written to track/.
 """
 
-import queue
-import signal
 import sys
-import threading
-from collections.abc import Iterator
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
@@ -31,53 +26,36 @@ from sfmapp.images.bag_sequence import decode_raw
 from sfmapp.images.headers import UnusableImage
 from sfmapp.odometry.snapshot import FrameSnapshot
 
-# While so many wait, what comes is dropped: a late pose is of no use to a robot.
-FRAMES_WAITING = 4
-
 
 class OdometryNode(Node):
-    """Images that wait to be tracked, and the poses that come of them."""
+    """Pushes images, and publishes the poses that come of them; both in threads of their own."""
 
     def __init__(self) -> None:
         super().__init__("sfmapp_odometry")
-        self.camera: sfmapp.Camera | None = None
-        self.has_camera = threading.Event()
-        self.waiting: queue.Queue[Image | None] = queue.Queue(FRAMES_WAITING)
-        self.num_dropped, self.white, self.time_s = 0, 255, 0.0
+        self.odometry: sfmapp.LiveOdometry | None = None
+        self.white = 255
         self.publisher = self.create_publisher(PoseStamped, "pose", 10)
         self.create_subscription(CameraInfo, "camera_info", self.on_info, qos_profile_sensor_data)
         self.create_subscription(Image, "image", self.on_image, qos_profile_sensor_data)
 
     def on_info(self, info: CameraInfo) -> None:
-        if self.camera is None and info.p[0] > 0:
+        if self.odometry is None and info.p[0] > 0:
             # the centre of the first pixel is at 0 in ROS, at a half in sfmapp
             params = np.array([info.p[0], info.p[5], info.p[2] + 0.5, info.p[6] + 0.5])
-            self.camera = sfmapp.Camera(sfmapp.CameraModel.PINHOLE, info.width, info.height, params)
-            self.has_camera.set()
+            camera = sfmapp.Camera(sfmapp.CameraModel.PINHOLE, info.width, info.height, params)
+            self.odometry = sfmapp.LiveOdometry(camera, "track", on_pose=self.publish, record=False)
 
     def on_image(self, image: Image) -> None:
+        if self.odometry is None:
+            return
+        stamp = Stamp(Time.from_msg(image.header.stamp).nanoseconds, image.header.frame_id)
+        data, is_big_endian = memoryview(image.data), bool(image.is_bigendian)
+        raw = RawImage(stamp, image.height, image.width, image.encoding, is_big_endian, image.step, data)
         try:
-            self.waiting.put_nowait(image)
-        except queue.Full:
-            self.num_dropped += 1
-
-    def frames(self) -> Iterator[np.ndarray]:
-        while (image := self.waiting.get()) is not None:
-            stamp = Stamp(Time.from_msg(image.header.stamp).nanoseconds, image.header.frame_id)
-            data, is_big_endian = memoryview(image.data), bool(image.is_bigendian)
-            raw = RawImage(stamp, image.height, image.width, image.encoding, is_big_endian, image.step, data)
-            try:
-                gray, self.white = decode_raw(raw, self.white)
-            except UnusableImage as reason:
-                self.get_logger().warning(f"an image is left out: {reason}")
-                continue
-            if stamp.ns / 1e9 > self.time_s:
-                self.time_s = stamp.ns / 1e9
-                yield gray
-
-    def times(self) -> Iterator[float]:
-        while True:  # one is asked for when its frame has come
-            yield self.time_s
+            gray, self.white = decode_raw(raw, self.white)
+            self.odometry.push(gray, stamp.ns / 1e9)
+        except (UnusableImage, sfmapp.InputError) as reason:
+            self.get_logger().warning(f"an image is left out: {reason}")
 
     def publish(self, frame: FrameSnapshot) -> None:
         if not np.isfinite(frame.cam_from_world).all():
@@ -92,29 +70,21 @@ class OdometryNode(Node):
             setattr(message.pose.position, name, value)
         self.publisher.publish(message)
 
-    def listen(self) -> None:
-        try:
-            rclpy.spin(self)
-        except ExternalShutdownException:
-            pass
-        finally:
-            self.has_camera.set()
-            self.waiting.put(None)
-
 
 def main() -> None:
     # a Ctrl-C ends the frames, and not what is made of them
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGINT, lambda *_: rclpy.shutdown())
     node = OdometryNode()
-    threading.Thread(target=node.listen, daemon=True).start()
-    node.has_camera.wait()
-    if node.camera is None:
+    try:
+        while True:
+            rclpy.spin_once(node, timeout_sec=0.5)
+    except KeyboardInterrupt:
+        pass
+    if node.odometry is None:
         sys.exit("no camera_info came")
-    frames = sfmapp.ArraySequence(node.frames(), node.camera, timestamps_s=node.times())
-    result = sfmapp.track_sequence(frames, "track", record=False, on_frame=node.publish)
-    tracked = np.isfinite(result.odometry.cam_from_world[:, 0])
-    print(f"{tracked.sum()} of {len(tracked)} frames have a pose, {node.num_dropped} were dropped")
+    tracked = np.isfinite(node.odometry.close().odometry.cam_from_world[:, 0])
+    print(f"{tracked.sum()} of {len(tracked)} frames have a pose, {node.odometry.report.num_dropped} were dropped")
+    rclpy.shutdown()
 
 
 if __name__ == "__main__":

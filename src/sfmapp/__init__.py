@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         undistort,
         validate,
     )
+    from sfmapp.api.live import LiveOdometry
     from sfmapp.api.planes import rectify, warp_picture
     from sfmapp.api.reconstruction import Reconstruction, load
     from sfmapp.api.stages import Matcher, extract_features, map_images, match_images
@@ -90,6 +91,7 @@ __all__ = [
     "ImageSource",
     "InputError",
     "InterruptedRunError",
+    "LiveOdometry",
     "MappingOptions",
     "Matcher",
     "MatchingOptions",
@@ -187,6 +189,7 @@ _HOMES = {
     "find_masks": "api.volumes",
     "export": "api.jobs",
     "extract_features": "api.stages",
+    "LiveOdometry": "api.live",
     "load": "api.reconstruction",
     "load_images": "api.images",
     "load_options": "workspace.options",

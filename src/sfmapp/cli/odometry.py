@@ -30,6 +30,7 @@ examples:
   sfmapp odometry frames/ -o out/ --camera calib.json --scale marker:DICT_4X4_50:0.16
   sfmapp odometry second_walk.mp4 -o out2/ --map out/ --camera PINHOLE,525,525,320,240
   sfmapp odometry drive.mcap -o out/ --image-topic /camera/image_raw
+  sfmapp odometry camera:0 -o out/ --camera calib.json     # or rtsp://HOST/STREAM; Ctrl-C ends it
 
 Frames come from a folder of images, a video or stream, a bag of ROS 1 or 2, or a sequence of KITTI, TUM or EuRoC, whose
 cameras, times, ground truth and IMU are found automatically. With two cameras lengths are in metres; with one their
@@ -223,12 +224,12 @@ def summary(output: Path, report: OdometryRunReport) -> dict[str, object]:
     paths = {name: str(output / path) for name, path in (
         ("trajectory", "trajectory.tum"), ("model", "sparse/0"), ("report", "report.json"),
     )}  # fmt: skip
-    named = ("frames", "maps", "ground_truth", "timing", "run")
+    named = ("frames", "maps", "ground_truth", "timing", "live", "run")
     return {"output": str(output), **paths, **{name: report[name] for name in named}}
 
 
 def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
-    from sfmapp.report.odometry_html import known_map_text, scale_text
+    from sfmapp.report.odometry_html import known_map_text, live_text, scale_text
 
     output, frames, first, run, timing = (
         args.output, report.frames, report.maps[0], report.run, report.timing,
@@ -252,6 +253,8 @@ def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
             )
     if report.stages.odometry is not None and report.stages.odometry.known_map is not None:
         print(f"  {known_map_text(report.stages.odometry.known_map)}")
+    if report.live is not None:
+        print(f"  {live_text(report.live)}")
     print_contradictions(row for found in report.maps for row in found.contradictions)
     pace = ""
     if timing is not None:

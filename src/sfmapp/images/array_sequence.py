@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from typing import Any
 
 import numpy as np
@@ -84,23 +84,36 @@ class ArraySequence:
             if not last_s < timestamp_s < math.inf:
                 raise InputError(f"frame {name}: expected a time after {last_s:g} s, found {timestamp_s:g}")
             last_s = timestamp_s
-            images = item if isinstance(item, tuple | list) else (item,)
-            if len(images) != len(self.rig.cameras):
-                raise InputError(f"frame {name}: expected {len(self.rig.cameras)} images, found {len(images)}")
-            yield Frame(
-                idx, name, timestamp_s, tuple(self._gray(name, k, image, white) for k, image in enumerate(images))
-            )
+            yield Frame(idx, name, timestamp_s, gray_images(name, item, self.rig, white))
 
-    def _gray(self, name: str, camera_idx: int, image: NDArray[Any], white: list[int]) -> Pixels:
-        import cv2
 
-        raw = checked_pixels(f"frame {name}", image)
-        camera = self.rig.cameras[camera_idx]
-        if raw.shape[:2] != (camera.height, camera.width):
-            size = f"{raw.shape[1]}x{raw.shape[0]}"
-            raise InputError(f"frame {name}: {size} pixels, but its camera has {camera.width}x{camera.height}")
-        if raw.dtype == np.uint16:
-            raw, white[camera_idx] = scaled_to_8_bits(raw, white[camera_idx])
-        if raw.ndim == 3:
-            raw = cv2.cvtColor(raw, cv2.COLOR_RGBA2GRAY if raw.shape[2] == 4 else cv2.COLOR_RGB2GRAY)
-        return np.array(raw, np.uint8)  # a copy: grabbers use their buffers again
+def gray_images(
+    name: str, item: NDArray[Any] | Sequence[NDArray[Any]], rig: Rig, white: list[int]
+) -> tuple[Pixels, ...]:
+    """A frame, or one for each camera of a rig, as (H, W) 8-bit grey of their own.
+
+    Args:
+        item: as of :class:`ArraySequence`.
+        white: largest value that each camera's deeper frames were found to reach, 255 to begin with; it grows here.
+
+    Raises:
+        InputError: an array that is no picture, or of another shape than its camera's.
+    """
+    images = item if isinstance(item, tuple | list) else (item,)
+    if len(images) != len(rig.cameras):
+        raise InputError(f"frame {name}: expected {len(rig.cameras)} images, found {len(images)}")
+    return tuple(_gray(name, rig.cameras[k], image, white, k) for k, image in enumerate(images))
+
+
+def _gray(name: str, camera: Camera, image: NDArray[Any], white: list[int], camera_idx: int) -> Pixels:
+    import cv2
+
+    raw = checked_pixels(f"frame {name}", image)
+    if raw.shape[:2] != (camera.height, camera.width):
+        size = f"{raw.shape[1]}x{raw.shape[0]}"
+        raise InputError(f"frame {name}: {size} pixels, but its camera has {camera.width}x{camera.height}")
+    if raw.dtype == np.uint16:
+        raw, white[camera_idx] = scaled_to_8_bits(raw, white[camera_idx])
+    if raw.ndim == 3:
+        raw = cv2.cvtColor(raw, cv2.COLOR_RGBA2GRAY if raw.shape[2] == 4 else cv2.COLOR_RGB2GRAY)
+    return np.array(raw, np.uint8)  # a copy: grabbers use their buffers again

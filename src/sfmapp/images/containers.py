@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
+from sfmapp.images.addresses import check_address, without_credentials
 from sfmapp.images.frame_reader import LARGEST_FRAME_PX
 from sfmapp.images.sources import printable
 
@@ -77,10 +78,17 @@ class Damaged:
     """A packet that holds no frame that can be decoded."""
 
 
+def shown(source: str) -> str:
+    """A source as messages name it."""
+    return without_credentials(printable(source))
+
+
 def open_container(source: str, *, is_stream: bool) -> InputContainer:
     """An opened file or URL. Raises InputError: it holds no video, or frames too large to be decoded."""
     import av
 
+    if is_stream:
+        check_address(source)
     protocols = _PROTOCOLS_OF_STREAMS if is_stream else _PROTOCOLS_OF_FILES
     options = {"protocol_whitelist": protocols}
     if source.lower().startswith("rtsp"):
@@ -92,12 +100,12 @@ def open_container(source: str, *, is_stream: bool) -> InputContainer:
     except (av.FFmpegError, OSError, ValueError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"{printable(source)}: expected a video that FFmpeg can read, found none: {reason}", _ADVICE
+            f"{shown(source)}: expected a video that FFmpeg can read, found none: {reason}", _ADVICE
         ) from None
     problem = _problem_of(container)
     if problem:
         container.close()
-        raise InputError(f"{printable(source)}: {problem}", _ADVICE)
+        raise InputError(f"{shown(source)}: {problem}", _ADVICE)
     stream = best_stream(container)
     stream.thread_type = "AUTO"
     # later frames may claim another size than the header
@@ -139,9 +147,7 @@ def read_container_facts(source: str, *, is_stream: bool) -> VideoFacts:
             if first is not None or number > _PACKETS_TO_FIRST_FRAME:
                 break
         if first is None:
-            raise InputError(
-                f"{printable(source)}: expected a video with frames, found none that can be decoded", _ADVICE
-            )
+            raise InputError(f"{shown(source)}: expected a video with frames, found none that can be decoded", _ADVICE)
         height, width = gray_of(first).shape
         fps, count = _rate(stream.average_rate or stream.guessed_rate), stream.frames or None
         if is_stream:

@@ -72,6 +72,7 @@ class Frame:
         elapsed_s: seconds since the sequence began, which a clock since 1970 tells to a quarter of a microsecond only;
             None where nothing more exact than ``timestamp_s`` is known.
         given_s: what ``timestamp_s`` was before the time that has elapsed took its place; None while it is that itself.
+        captured_s: of a live source, when the frame came, on the clock of ``time.monotonic``; None of recorded ones.
     """
 
     idx: int
@@ -80,6 +81,7 @@ class Frame:
     images: tuple[NDArray[np.uint8], ...]
     elapsed_s: float | None = None
     given_s: float | None = None
+    captured_s: float | None = None
 
     @property
     def shown_s(self) -> float:

@@ -25,6 +25,7 @@ from sfmapp.images.containers import (
     gray_of,
     open_container,
     read_container_facts,
+    shown,
 )
 from sfmapp.images.frame_reader import (
     LARGEST_FRAME_PX,
@@ -34,7 +35,8 @@ from sfmapp.images.frame_reader import (
     resampled,
     skipped_twin,
 )
-from sfmapp.images.sequence import Frame, GroundTruth, Imu, RepeatedFrame, SequenceKind, SequenceOptions
+from sfmapp.images.live_buffer import LiveBuffer, LiveCounts, read_newest
+from sfmapp.images.sequence import STAGE, Frame, GroundTruth, Imu, RepeatedFrame, SequenceKind, SequenceOptions
 from sfmapp.images.sources import VIDEOS
 from sfmapp.scene.rig import Rig
 
@@ -45,6 +47,8 @@ _DEVICE = re.compile(r"camera:(\d{1,3})|/dev/video(\d{1,3})")
 DEFAULT_FPS = 30.0
 # A file that ends this much before the end in its header was cut off; headers err by a little.
 _CUT_OFF_SHARE = 0.98
+# A camera or stream that gives nothing for so long has ended: drivers and FFmpeg give up after 10 to 15 seconds.
+STALL_S = 10.0
 
 
 def is_stream(source: str) -> bool:
@@ -112,10 +116,11 @@ _Walk = Iterator["_Unread | Damaged"]
 
 @dataclass(frozen=True)
 class _Unread:
-    """A frame of which it is not yet known whether it is wanted."""
+    """A frame of which it is not yet known whether it is wanted; ``captured_s``: of a camera, when it was there."""
 
     gray: Callable[[], Pixels]
     time_s: Fraction | None
+    captured_s: float | None = None
 
 
 def _walk_through(source: str) -> _Walk:
@@ -133,25 +138,27 @@ def _frames_of_device(source: str) -> _Walk:
 
     capture = _open_device(source)
     try:
-        while True:
-            is_read, image = capture.read()
+        while capture.grab():
+            captured_s = time.monotonic()
+            is_read, image = capture.retrieve()
             if not is_read or image is None:
                 return
             gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-            yield _Unread(partial(np.asarray, gray), None)
+            yield _Unread(partial(np.asarray, gray), None, captured_s)
     finally:
         capture.release()
 
 
 @dataclass
 class VideoSequence:
-    """A :class:`~sfmapp.images.sequence.Sequence` of a video. A stream or camera can be walked through once.
+    """A :class:`~sfmapp.images.sequence.Sequence` of a video. A stream or camera can be walked through once; of its
+    frames those are dropped that come faster than they are taken.
 
     Frames are stamped with the time that the file gives them; where that does not advance, with the nominal rate; of a
     stream or camera with the clock, from the first frame on.
     """
 
-    source: str
+    source: str = field(repr=False)  # it may hold a password
     rig: Rig
     facts: VideoFacts
     options: SequenceOptions
@@ -173,6 +180,12 @@ class VideoSequence:
         fps = self.options.fps or self.facts.fps
         self.frames_per_second = fps / self.options.step if fps else None
         self._teller = ProblemReporter(self.events)
+        self._buffer = LiveBuffer() if is_stream(self.source) else None
+
+    @property
+    def counts(self) -> LiveCounts | None:
+        """What has come of a stream or camera so far; None of a file."""
+        return None if self._buffer is None else self._buffer.counts
 
     @property
     def repeated(self) -> list[RepeatedFrame]:
@@ -185,6 +198,10 @@ class VideoSequence:
 
     def _items(self) -> Iterator[Frame | Skipped]:
         reader = _VideoReader(self)
+        if self._buffer is not None:
+            yield from read_newest(reader, self._buffer, lambda: not self.events.is_cancelled, STALL_S)
+            self.events.decided(STAGE, f"{shown(self.source)}: {self._buffer.counts.end}")
+            return
         try:
             yield from read_ahead(reader)
         finally:
@@ -238,7 +255,8 @@ class _VideoReader:
         self._idx += 1
         if isinstance(item, Damaged):
             return Skipped(name, "cannot be decoded: its data are damaged")
-        stamp, gray = self._timestamp(position, item.time_s), item.gray()
+        captured_s = (item.captured_s or time.monotonic()) if self._is_live else None
+        stamp, gray = self._timestamp(position, item.time_s, captured_s), item.gray()
         elapsed_s = self._elapsed(stamp, item.time_s)
         camera = self._video.rig.cameras[0]
         if gray.shape != (camera.height, camera.width):
@@ -247,14 +265,14 @@ class _VideoReader:
         if self._last is not None and np.array_equal(gray, self._last):
             return skipped_twin(idx, name, stamp, self._last_idx)
         self._last, self._last_idx = gray, idx
-        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),), elapsed_s)
+        return Frame(idx, name, stamp, (resampled(gray, self._video.sampling[0]),), elapsed_s, captured_s=captured_s)
 
-    def _timestamp(self, position: int, time_s: Fraction | None) -> float:
+    def _timestamp(self, position: int, time_s: Fraction | None, captured_s: float | None) -> float:
         fps = self._video.options.fps
         if fps is not None:
             return position / fps
-        if self._is_live:
-            return max(time.monotonic() - self._start, self._last_s + 1e-6)
+        if captured_s is not None:
+            return max(captured_s - self._start, self._last_s + 1e-6)
         if time_s is not None and float(time_s) > self._last_s:
             return float(time_s)
         step = 1 / (self._video.facts.fps or DEFAULT_FPS)

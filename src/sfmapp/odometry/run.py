@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -149,7 +150,7 @@ class Odometry:
         snapshot = FrameSnapshot(
             frame.idx, frame.name, frame.shown_s, record.state, frame.images[0],
             self.tracked.tracks.xy.astype(np.float32), self.tracked.is_mapped, record.live, record.map_idx,
-            record.cpu_s,
+            record.cpu_s, math.nan if frame.captured_s is None else time.monotonic() - frame.captured_s,
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
         return record

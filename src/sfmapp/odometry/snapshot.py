@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ class FrameSnapshot:
         cam_from_world: (7,) pose as it was given out, NaN without one.
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
         cpu_s: CPU seconds of tracking, back end not included.
+        latency_s: of a live source, seconds from when the frame came until its pose was known; NaN of recorded ones.
     """
 
     frame_idx: int
@@ -36,6 +38,7 @@ class FrameSnapshot:
     cam_from_world: Array
     map_idx: int
     cpu_s: float
+    latency_s: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -592,7 +592,7 @@ class GroundTruthReport(Report):
 
 
 class FrameTimes(Report):
-    """CPU milliseconds of tracking, over the frames."""
+    """Milliseconds, over the frames."""
 
     median: float
     p95: float
@@ -605,7 +605,7 @@ class TimingReport(Report):
     Attributes:
         times_real_time: speed against the camera's; None where its rate is not known.
         parts_cpu_ms: CPU milliseconds of a frame by part of the work.
-        tracking_ms: None where nothing was tracked.
+        tracking_ms: CPU time of tracking; None where nothing was tracked.
     """
 
     num_frames: int
@@ -616,6 +616,27 @@ class TimingReport(Report):
     cpu_ms_per_frame: float
     parts_cpu_ms: Mapping[str, float]
     tracking_ms: FrameTimes | None
+
+
+class LiveReport(Report):
+    """What came of a camera that does not wait, or of a program that pushes frames.
+
+    Attributes:
+        num_arrived: frames that it gave. num_dropped: of these, those that newer ones pushed out before they could be
+            tracked.
+        max_waiting: places for frames that wait to be tracked.
+        longest_silence_s: longest time without a frame.
+        end: why there were no more; empty while there may be.
+        latency_ms: from when a frame came until its pose was known; None where none was tracked.
+    """
+
+    num_arrived: int
+    num_dropped: int
+    num_tracked: int
+    max_waiting: int
+    longest_silence_s: float
+    end: str
+    latency_ms: FrameTimes | None
 
 
 class LensEvidence(Report):
@@ -679,7 +700,7 @@ class OdometryStages(Report):
 
 
 class OdometryRunReport(Report):
-    """The report of ``sfmapp odometry``; ``timing`` is None without a frame."""
+    """The report of ``sfmapp odometry``; ``timing`` is None without a frame, ``live`` of what was recorded before."""
 
     format: str
     outcome: Outcome
@@ -689,6 +710,7 @@ class OdometryRunReport(Report):
     maps: Sequence[MapReport]
     ground_truth: Sequence[GroundTruthReport]
     timing: TimingReport | None
+    live: LiveReport | None
     checks: Sequence[Check]
     usage: Mapping[str, Usage]
     warnings: Sequence[LogLine]

@@ -24,7 +24,17 @@ from sfmapp.images.sequence import GroundTruth
 from sfmapp.odometry.report import KnownMapReport
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.report.document import check, check_contradictions
-from sfmapp.report.model import Check, FramesReport, Gap, GroundTruthReport, Light, MapReport, MedianMax, TimingReport
+from sfmapp.report.model import (
+    Check,
+    FramesReport,
+    Gap,
+    GroundTruthReport,
+    Light,
+    LiveReport,
+    MapReport,
+    MedianMax,
+    TimingReport,
+)
 
 FORMAT = "sfmapp odometry report 2"
 Array = NDArray[np.float64]
@@ -221,11 +231,12 @@ def ground_truth_row(fit: GroundTruthFit, map_idx: int, poses: Literal["final", 
 def make_checks(
     frames: FramesReport,
     maps: Sequence[MapReport],
-    timing: TimingReport | None,
+    pace: TimingReport | LiveReport | None,
     facts: FrameTable,
     known_map: KnownMapReport | None = None,
 ) -> list[Check]:
-    """Traffic lights over a run, each with its thresholds in words."""
+    """Traffic lights over a run, each with its thresholds in words; ``pace``: against the rate of the camera, or of a
+    live source."""
     share = 100 * frames.num_in_largest_map / max(1, frames.num_frames)
     rows = [
         check("frames with a pose in the largest map", share, f"{share:.1f} %", 98, 80, "%"),
@@ -237,8 +248,11 @@ def make_checks(
     if maps:
         error = maps[0].mean_reprojection_error_px
         rows.append(check("reprojection error of the keyframes (mean)", -error, f"{error:.2f} px", -1, -2, "px"))
-    if timing is not None and timing.times_real_time:
-        speed = timing.times_real_time
+    if isinstance(pace, LiveReport):
+        in_time = 100 * (1 - pace.num_dropped / max(1, pace.num_arrived))
+        rows.append(check("frames that were tracked in time", in_time, f"{in_time:.1f} %", 95, 60, "%"))
+    elif pace is not None and pace.times_real_time:
+        speed = pace.times_real_time
         rows.append(check("speed against the camera's", speed, f"{speed:.2f} x", 1, 0.5, "x"))
     for found in maps:
         if found.covariance_gap:

@@ -15,6 +15,7 @@ from sfmapp.odometry.result import OdometryResult
 from sfmapp.report.model import (
     Gap,
     GroundTruthReport,
+    LiveReport,
     LogLine,
     MapReport,
     OdometryRunReport,
@@ -49,7 +50,7 @@ def render_odometry_html(
         body.append(_known_map(report.stages.odometry.known_map))
     body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
     body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps))
-    body.append(_timing(report.timing) + usage_table(report.usage, report.run))
+    body.append(_live(report.live) + _timing(report.timing) + usage_table(report.usage, report.run))
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp odometry: {report.run.source}", body)
 
@@ -277,6 +278,26 @@ def refined(camera: SequenceCamera) -> str:
     if (found := camera.refined) is None:
         return ""
     return f"{found.model}: " + ", ".join(f"{name} {value:.6g}" for name, value in found.params.items())
+
+
+def live_text(live: LiveReport) -> str:
+    """What became of the frames of a live source, and how old their poses were, in a sentence or two."""
+    text = f"{live.num_arrived} frames came, {live.num_dropped} of them were dropped because newer ones were there"
+    if (latency := live.latency_ms) is not None:
+        text += (
+            f"; a pose was known {latency.median:.0f} ms after its frame had come (median; 95 %: {latency.p95:.0f} ms, "
+            f"at most {latency.max:.0f} ms)"
+        )
+    return f"{text}; {live.end}" if live.end else text
+
+
+def _live(live: LiveReport | None) -> str:
+    if live is None:
+        return ""
+    note = (
+        f"At most {live.max_waiting} frames wait. The longest time without a frame was {live.longest_silence_s:.2f} s."
+    )
+    return f"<h2>Live</h2><p>{escape(live_text(live))}.</p><p class=dim>{note}</p>"
 
 
 def _timing(timing: TimingReport | None) -> str:

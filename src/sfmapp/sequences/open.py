@@ -24,6 +24,7 @@ from sfmapp.formats.trajectory_input import read_trajectory
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.orientation import INVERSE, is_sideways, upright_size
 from sfmapp.images.bag_sequence import BagSequence
+from sfmapp.images.containers import shown
 from sfmapp.images.exif import ExifFacts, focal_prior, read_exif
 from sfmapp.images.frame_reader import FileSequence, read_regular_file, some
 from sfmapp.images.headers import UnusableImage, read_header
@@ -526,7 +527,7 @@ def _open_video(
     size = (facts.width, facts.height)
     folders = [Path(source).absolute().parent] if look_beside and not is_stream(source) else []
     calibration = _calibration(options.camera, folders, None, False, (size,))
-    rig = _rig(source, calibration, (size,), None, events, require_camera)
+    rig = _rig(shown(source), calibration, (size,), None, events, require_camera)
     body_from_cam = calibration.body_from_cam if calibration else None
     imu = _given_imu(options.imu, body_from_cam, None, events) if options.imu is not None else None
     ground_truth = None

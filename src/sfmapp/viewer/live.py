@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
+from sfmapp.images.addresses import without_credentials
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.packages import MissingPackageError, require
@@ -62,6 +63,11 @@ def thinned_stride(frame_number: int, num_frames: int | None) -> int:
     return 1 << max(0, (frame_number // MAX_IMAGES).bit_length())
 
 
+def _title(source: str) -> str:
+    """A stream without its passwords; of a path the last part."""
+    return without_credentials(source) if "://" in source else os.path.basename(os.path.abspath(source)) or source
+
+
 class LiveView:
     """Listener of a run; a context manager that ends its child in any case."""
 
@@ -93,7 +99,7 @@ class LiveView:
         ]  # fmt: skip
         self._send_queue = SendQueue(command)
         self._send(
-            "begin", title=os.path.basename(os.path.abspath(sequence.source)) or sequence.source, camera=camera,
+            "begin", title=_title(sequence.source), camera=camera,
             ground_truth_times=None if ground_truth is None else ground_truth.timestamps_s,
             ground_truth_cam_from_world=None if ground_truth is None else ground_truth.cam_from_world,
             is_metric=sequence.rig.is_stereo, orientation=sequence.orientation,

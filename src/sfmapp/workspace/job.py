@@ -22,6 +22,7 @@ from typing import Any, Self
 import sfmapp
 from sfmapp.errors import InputError, is_full
 from sfmapp.events import Events, Listener
+from sfmapp.images.addresses import without_credentials
 from sfmapp.report.model import RunFacts, RunUsage
 from sfmapp.reporting import Usage
 from sfmapp.workspace.listeners import DecisionLog, EventLog
@@ -88,12 +89,19 @@ class Job:
             log = DecisionLog()
             events.subscribe(log)
             stack.callback(events.unsubscribe, log)
-            lines = stack.enter_context(EventLog(workspace.log, events, source=source, version=sfmapp.__version__))
+            lines = stack.enter_context(
+                EventLog(workspace.log, events, source=without_credentials(source), version=sfmapp.__version__)
+            )
             stack.enter_context(one_blas_thread())
             options = with_absolute_paths(options or Options())
             job = cls(source, workspace, options, events, watch or Stopwatch(), log, stack, **own)
             job.listen(lines)
             yield job
+
+    @property
+    def shown(self) -> str:
+        """The source as it may be told and written."""
+        return without_credentials(self.source)
 
     @property
     def threads(self) -> int:
@@ -150,7 +158,7 @@ class Job:
     def facts(self) -> RunFacts:
         """What the report says of the run: how it was called, and what it has taken so far."""
         return RunFacts(
-            source=self.source,
+            source=self.shown,
             seed=self.options.seed,
             threads=self.threads,
             options=options_to_dict(self.options),
@@ -163,7 +171,7 @@ class Job:
         """Write down what this run works on and how, before it begins; ``inputs``: digests by name."""
         self.workspace.note(
             # absolute, so that the workspace can be looked at from anywhere; a stream has no place
-            source=self.source if "://" in self.source else os.path.abspath(self.source),
+            source=self.shown if "://" in self.source else os.path.abspath(self.source),
             seed=self.options.seed,
             options=options_to_dict(self.options),
             versions={"sfmapp": sfmapp.__version__, **recorded_versions()},

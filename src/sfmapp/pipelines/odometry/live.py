@@ -1,4 +1,4 @@
-"""The poses of an odometry run on their way to the disk while it is under way.
+"""An odometry run while it is under way: poses on their way to the disk, and how old they are when they are known.
 
 A run that is killed leaves ``trajectory_live.tum`` (and ``trajectory_live-1.tum`` of its second map) with every pose
 that was given out until then; at the end :func:`~sfmapp.pipelines.odometry.results.write_trajectories` replaces them.
@@ -7,6 +7,7 @@ that was given out until then; at the end :func:`~sfmapp.pipelines.odometry.resu
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,13 @@ import numpy as np
 from sfmapp.errors import is_full
 from sfmapp.events import Event, Events
 from sfmapp.formats.trajectory import GrowingTum
+from sfmapp.images.live_buffer import LiveCounts
+from sfmapp.images.live_sequence import LiveSequence
+from sfmapp.images.sequence import Sequence
+from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.snapshot import FrameSnapshot
+from sfmapp.pipelines.odometry.timing import frame_statistics
+from sfmapp.report.model import LiveReport
 
 LIVE = re.compile(r"trajectory_live(-\d+)?\.tum")
 
@@ -69,3 +76,33 @@ class GrowingTrajectories:
         if seen.map_idx not in self._files:
             self._files[seen.map_idx] = GrowingTum(self._folder / numbered("trajectory_live", seen.map_idx))
         self._files[seen.map_idx].append(seen.timestamp_s, seen.cam_from_world)
+
+
+class LatencyLog:
+    """Listener that keeps how old the pose of each frame of a live source was when it was known."""
+
+    def __init__(self) -> None:
+        self._latencies_s = array("f")
+
+    def __call__(self, event: Event) -> None:
+        seen = event.data.get("snapshot")
+        if isinstance(seen, FrameSnapshot):
+            self.note(seen)
+
+    def note(self, frame: FrameSnapshot) -> None:
+        """Keep that of a frame; a recorded one has none."""
+        if np.isfinite(frame.latency_s):
+            self._latencies_s.append(frame.latency_s)
+
+    def report(self, counts: LiveCounts) -> LiveReport:
+        """What there is to say of a live source so far."""
+        return LiveReport(
+            num_arrived=counts.num_arrived, num_dropped=counts.num_dropped, num_tracked=len(self._latencies_s),
+            max_waiting=counts.max_waiting, longest_silence_s=round(counts.longest_silence_s, 3), end=counts.end,
+            latency_ms=frame_statistics(1e3 * np.array(self._latencies_s, np.float64)),
+        )  # fmt: skip
+
+
+def live_counts(sequence: Sequence | None) -> LiveCounts | None:
+    """What has come of a live source; None of a recorded sequence."""
+    return sequence.counts if isinstance(sequence, LiveSequence | VideoSequence) else None

@@ -19,7 +19,7 @@ from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.odometry.report import MapFacts
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.pipelines.odometry.filtering import filtered_csv
-from sfmapp.pipelines.odometry.live import numbered
+from sfmapp.pipelines.odometry.live import live_counts, numbered
 from sfmapp.pipelines.odometry.timing import frame_statistics
 from sfmapp.report.document import named_params
 from sfmapp.report.model import (
@@ -244,9 +244,10 @@ def make_report(
     frames = frame_summary(result)
     maps = [map_row(result, m) for m in range(len(result.maps))]
     known_map = None if result.report is None else result.report.known_map
-    timing = run.threads_cpu.timing(
-        len(result.frame_idx), run.frames.tracking_s, run.sequence.frames_per_second, frame_statistics(facts.time_ms)
-    )
+    counts = live_counts(run.sequence)
+    live = None if counts is None else run.latencies.report(counts)
+    rate = run.sequence.frames_per_second if live is None else None  # what is live sets the pace itself
+    timing = run.threads_cpu.timing(len(result.frame_idx), run.frames.tracking_s, rate, frame_statistics(facts.time_ms))
     return OdometryRunReport(
         format=FORMAT,
         outcome=_outcome(run, failure),
@@ -256,7 +257,8 @@ def make_report(
         maps=maps,
         ground_truth=_ground_truth_rows(run, result, facts, against),
         timing=timing,
-        checks=make_checks(frames, maps, timing, facts, known_map) if maps else [],
+        live=live,
+        checks=make_checks(frames, maps, timing or live, facts, known_map) if maps else [],
         usage=run.usage,
         warnings=run.log.warnings,
         decisions=run.log.decisions,
@@ -265,7 +267,7 @@ def make_report(
 
 
 def _outcome(run: Tracking, failure: NoReconstructionError | None) -> Outcome:
-    if run.events.is_cancelled:
+    if run.events.is_cancelled and live_counts(run.sequence) is None:  # that is how a live source ends
         message = "stopped on request: this is what was tracked until then"
         return Outcome(exit_code=InterruptedRunError.exit_code, message=message, advice="the same command begins again")
     return Outcome.of(failure)

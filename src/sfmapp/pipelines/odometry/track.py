@@ -23,6 +23,7 @@ from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.pipelines.odometry.filtering import filter_largest_map
 from sfmapp.pipelines.odometry.known_map import read_known_map
+from sfmapp.pipelines.odometry.live import live_counts
 from sfmapp.pipelines.odometry.results import write_odometry
 from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 from sfmapp.pipelines.odometry.tracking import Tracking
@@ -171,7 +172,7 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         result = result.with_repeated(run.sequence.repeated)
     failure = None if result.maps else no_map(run, result)
     report = write_odometry(run, result, failure)
-    if events.is_cancelled:
+    if events.is_cancelled and live_counts(run.sequence) is None:
         where = f"what was tracked so far is in {run.workspace.folder}"
         raise InterruptedRunError("stopped on request", f"{where}; the same command begins again")
     if failure is not None:
@@ -184,11 +185,11 @@ def no_map(run: Tracking, result: OdometryResult) -> NoReconstructionError:
     seen = len(result.frame_idx)
     if seen < 2:
         found = "no frame could be read" if seen == 0 else "only one frame could be read"
-        return NoReconstructionError(f"{run.source}: {found}", "-v names the files and what is wrong with them")
+        return NoReconstructionError(f"{run.shown}: {found}", "-v names the files and what is wrong with them")
     num_repeated = int((result.frame_state == FrameState.REPEATED).sum())
     if num_repeated == seen - 1:
         return NoReconstructionError(f"{run.source}: all {seen} frames show the same picture", NO_MAP_ADVICE)
-    text = f"{run.source}: {seen} frames were read, but no map could be initialized"
+    text = f"{run.shown}: {seen} frames were read, but no map could be initialized"
     if (report := result.report) is None:
         return NoReconstructionError(text, NO_MAP_ADVICE)
     for against in report.pairs:

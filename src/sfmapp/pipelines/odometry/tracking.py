@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sfmapp.pipelines.odometry.live import GrowingTrajectories
+from sfmapp.pipelines.odometry.live import GrowingTrajectories, LatencyLog
 from sfmapp.pipelines.odometry.timing import FrameLog, ThreadTimes
 from sfmapp.report.model import OdometryStages
 from sfmapp.viewer.live import LiveView, Screen
@@ -26,6 +26,7 @@ class Tracking(Job):
     Attributes:
         scale_request: what the unit of length is to come from; None: an arbitrary one will do.
         frames: what was told of each frame.
+        latencies: how old poses of a live source were.
         threads_cpu: CPU time by thread.
         live: draws what happens; None if nobody looks.
         sequence: once it is open.
@@ -34,6 +35,7 @@ class Tracking(Job):
 
     scale_request: ScaleRequest | None
     frames: FrameLog = field(default_factory=FrameLog)
+    latencies: LatencyLog = field(default_factory=LatencyLog)
     threads_cpu: ThreadTimes = field(default_factory=ThreadTimes)
     live: LiveView | None = None
     sequence: Sequence | None = None
@@ -47,7 +49,7 @@ class Tracking(Job):
         growing = GrowingTrajectories(self.workspace.folder, self.events, self.make_room)
         self.until_end.enter_context(closing(growing))
         self.listen(growing, first=True)  # whatever happens next, this pose is on the disk
-        for listener in (self.frames, self.live):
+        for listener in (self.frames, self.latencies, self.live):
             self.listen(listener)
 
     def make_room(self) -> bool:
