@@ -52,6 +52,12 @@ JUDGED = (
     Setting("street 2", lambda: street_world(2), (10.0, -1.6, 1.65), 60.0, 0.0, 0.6),
     Setting("clutter", lambda: cluttered_world(1), (0.0, 0.0, 0.0), 0.0, 0.0, 0.3),
 )
+# these were drawn after everything was chosen, and chose nothing
+FRESH = (
+    Setting("room 5", lambda: room_world(5), (1.2, 1.4, 1.5), -150.0, -10.0, 0.15),
+    Setting("hall 5", lambda: hall_world(5), (3.0, 3.0, 2.0), -120.0, -8.0, 0.5),
+    Setting("street 5", lambda: street_world(5), (4.0, -1.6, 1.65), 40.0, -1.0, 0.7),
+)
 
 
 def rendered_scene(setting: Setting, noise_sigma: float = 2.0) -> tuple[DenseScene, list[Map]]:

@@ -13,7 +13,7 @@ import pytest
 import sfmapp.pipelines.sweep.run as sweep_pipeline
 from dense_models import DEPTH, write_wall
 from schemas import check_schema
-from sfmapp.carve.plane_sweep import SweptDepth
+from sfmapp.carve.plane_sweep import SweptPlanes
 from sfmapp.cli.main import main
 from sfmapp.dense.scene import DenseScene
 from sfmapp.geometry import rigid3
@@ -79,15 +79,15 @@ def test_what_is_no_model_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_a_call_that_was_stopped_goes_on(wall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert swept(wall, tmp_path / "whole", "--level", "1", "-q") == 0
     calls: list[int] = []
-    usual = sweep_pipeline.sweep_view
+    usual = sweep_pipeline.sweep_planes
 
-    def sweep_view(scene: DenseScene, view: int, pool: Executor | None = None) -> SweptDepth:
+    def sweep_planes(scene: DenseScene, view: int, pool: Executor | None = None) -> SweptPlanes:
         calls.append(view)
         if len(calls) == 3:
             raise KeyboardInterrupt
         return usual(scene, view, pool)
 
-    monkeypatch.setattr(sweep_pipeline, "sweep_view", sweep_view)
+    monkeypatch.setattr(sweep_pipeline, "sweep_planes", sweep_planes)
     out = tmp_path / "stopped"
     with contextlib.suppress(KeyboardInterrupt):
         assert swept(wall, out, "--level", "1", "-q") != 0

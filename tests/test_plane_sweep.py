@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 
@@ -10,13 +10,18 @@ import numpy as np
 import pytest
 
 import dense_scenes
-from sfmapp.carve.plane_sweep import Planes, SweptDepth, sweep_view
+from sfmapp.carve.plane_sweep import Planes, SweptDepth, SweptPlanes, measured, sweep_planes
 from sfmapp.carve.sweep_agreement import confirm
-from sfmapp.dense.scene import DenseScene
+from sfmapp.carve.sweep_exchange import brought, exchange_planes
+from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.errors import NoReconstructionError
 from sfmapp.geometry import rigid3
 
 MIDDLE = 2
+
+
+def measured_alone(views: DenseScene, view: int, pool: Executor | None = None) -> SweptDepth:
+    return measured(views, view, sweep_planes(views, view, pool))
 
 
 @cache
@@ -27,8 +32,13 @@ def scene() -> tuple[DenseScene, list[np.ndarray]]:
 
 
 @cache
+def planes_of(view: int) -> SweptPlanes:
+    return sweep_planes(scene()[0], view)
+
+
+@cache
 def swept(view: int = MIDDLE) -> SweptDepth:
-    return sweep_view(scene()[0], view)
+    return measured(scene()[0], view, planes_of(view))
 
 
 def test_depth_is_that_of_the_scene_and_as_far_off_as_it_says() -> None:
@@ -64,7 +74,7 @@ def test_a_neighbour_held_upside_down_tells_the_same() -> None:
         k[2:] = [view.width - k[2], view.height - k[3]]
         rgb = np.ascontiguousarray(view.rgb[::-1, ::-1])
         turned[m] = replace(view, rgb=rgb, k=k, cam_from_world=rigid3.compose(half_turn, view.cam_from_world))
-    found = sweep_view(replace(views, views=tuple(turned)), MIDDLE)
+    found = measured_alone(replace(views, views=tuple(turned)), MIDDLE)
     both = np.isfinite(found.depth) & np.isfinite(swept().depth)
     assert both.mean() > 0.97
     assert np.quantile(np.abs(found.depth - swept().depth)[both] / depths[MIDDLE][both], 0.95) < 2e-3
@@ -75,7 +85,7 @@ def test_masked_pixels_have_no_depth_and_masked_neighbours_say_nothing() -> None
     height, width = depths[0].shape
     open_right = np.tile(np.arange(width) >= width // 2, (height, 1))
     some = [replace(view, mask=open_right if m in (0, MIDDLE) else None) for m, view in enumerate(views.views)]
-    found = sweep_view(replace(views, views=tuple(some)), MIDDLE)
+    found = measured_alone(replace(views, views=tuple(some)), MIDDLE)
     assert not np.isfinite(found.depth[:, : width // 2]).any()
     right = found.depth[:, width // 2 :]
     known = np.isfinite(right)
@@ -85,7 +95,7 @@ def test_masked_pixels_have_no_depth_and_masked_neighbours_say_nothing() -> None
 
 def test_bytes_do_not_depend_on_threads() -> None:
     with ThreadPoolExecutor(1) as pool:
-        found = sweep_view(scene()[0], MIDDLE, pool)
+        found = measured_alone(scene()[0], MIDDLE, pool)
     for one, other in ((found.depth, swept().depth), (found.sigma, swept().sigma)):
         assert one.tobytes() == other.tobytes()
 
@@ -94,7 +104,7 @@ def test_pictures_of_noise_have_hardly_any_depth() -> None:
     views, _ = scene()
     rng = np.random.default_rng(3)
     noise = [replace(view, rgb=rng.integers(0, 256, view.rgb.shape, np.uint8)) for view in views.views]
-    assert np.isfinite(sweep_view(replace(views, views=tuple(noise)), MIDDLE).depth).mean() < 0.05
+    assert np.isfinite(measured_alone(replace(views, views=tuple(noise)), MIDDLE).depth).mean() < 0.05
 
 
 def test_a_view_without_neighbours_is_named() -> None:
@@ -102,7 +112,7 @@ def test_a_view_without_neighbours_is_named() -> None:
     alone = views.neighbors.copy()
     alone[1] = -1
     with pytest.raises(NoReconstructionError, match=r"1\.png: no other photograph"):
-        sweep_view(replace(views, neighbors=alone), 1)
+        measured_alone(replace(views, neighbors=alone), 1)
 
 
 def test_other_maps_confirm_what_is_right_and_contradict_what_is_not() -> None:
@@ -123,3 +133,62 @@ def test_maps_say_nothing_of_what_they_do_not_show() -> None:
     agree, against = confirm(views.views[MIDDLE], swept(), [(views.views[0], nothing)])
     assert not agree.any()
     assert not against.any()
+
+
+def test_a_plane_is_the_same_plane_in_another_view() -> None:
+    views, depths = scene()
+    view, other = views.views[1], views.views[MIDDLE]
+    # a wall across the line of sight at a slant, n x = 1 in the frame of the view
+    normal = np.array([0.2, -0.15, 1.0]) / np.median(depths[1])
+
+    def exact(to: DenseView) -> tuple[np.ndarray, np.ndarray]:
+        pose = rigid3.compose(to.cam_from_world, rigid3.inverse(view.cam_from_world))
+        own = rigid3.rotation_matrix(pose) @ normal
+        own /= 1.0 + own @ pose[4:]
+        v, u = np.mgrid[: to.height, : to.width] + 0.5
+        fx, fy, cx, cy = to.k
+        return own[0] * (u - cx) / fx + own[1] * (v - cy) / fy + own[2], own[:2] / (fx, fy)
+
+    inverse, slopes = exact(view)
+    planes = Planes(0.05, 0.01, 20)
+    plane = ((inverse - planes.first) / planes.step).astype(np.float32)
+    leans = np.broadcast_to(slopes / planes.step, (*plane.shape, 2)).astype(np.float32)
+    told, told_slopes = brought(view, SweptPlanes(planes, plane, leans, ()), other)
+    known = np.isfinite(told)
+    assert known.mean() > 0.5
+    true, true_slopes = exact(other)
+    np.testing.assert_allclose(told[known], true[known], rtol=1e-5)
+    np.testing.assert_allclose(told_slopes[known], np.broadcast_to(true_slopes, told_slopes.shape)[known], rtol=1e-3)
+
+
+def test_other_maps_fill_what_one_lost_and_right_what_it_got_wrong() -> None:
+    views, depths = scene()
+    damaged = planes_of(MIDDLE).plane.copy()
+    lost, wrong = np.s_[40:70, 20:60], np.s_[100:130, 20:60]
+    damaged[lost] = np.nan
+    damaged[wrong] *= 0.7
+    told = {m: planes_of(m) for m in range(5)} | {MIDDLE: replace(planes_of(MIDDLE), plane=damaged)}
+    alone, found = (measured(views, MIDDLE, each) for each in (told[MIDDLE], exchange_planes(views, MIDDLE, told)))
+    for part in (lost, wrong):
+        true = depths[MIDDLE][part]
+        assert (np.abs(alone.depth[part] - true) < 0.01 * true).mean() < 0.1
+        assert (np.abs(found.depth[part] - true) < 0.01 * true).mean() > 0.95
+    # and nothing is lost elsewhere
+    right, before = (np.abs(each.depth - depths[MIDDLE]) < 0.01 * depths[MIDDLE] for each in (found, swept()))
+    assert right.mean() > before.mean() - 0.002
+    with ThreadPoolExecutor(1) as pool:
+        again = exchange_planes(views, MIDDLE, told, pool)
+    assert again.plane.tobytes() == exchange_planes(views, MIDDLE, told).plane.tobytes()
+
+
+def test_masked_pixels_are_told_nothing() -> None:
+    views, _ = scene()
+    some, own = list(views.views), planes_of(MIDDLE)
+    mask = np.ones(own.plane.shape, np.bool_)
+    mask[:, :50] = False
+    some[MIDDLE] = replace(some[MIDDLE], mask=mask)
+    masked = replace(own, plane=np.where(mask, own.plane, np.float32(np.nan)))
+    told = {m: planes_of(m) for m in range(5)} | {MIDDLE: masked}
+    found = exchange_planes(replace(views, views=tuple(some)), MIDDLE, told)
+    assert not np.isfinite(found.plane[~mask]).any()
+    assert np.isfinite(found.plane[mask]).mean() > 0.97

@@ -3,9 +3,10 @@
 A plane brings the neighbours' pictures to the reference's by a homography; where it meets the surface they look alike.
 Planes are even in inverse depth, a pixel of the usual neighbour apart. Costs, paths, levels and tests of a match are
 those of :mod:`sfmapp.stereo.semiglobal`; of several neighbours the better two count, so that what is hidden from some
-is told by others. A slanted plane of each pixel takes it from there (:mod:`sfmapp.carve.slanted_sweep`). Sigma and
-confidence go by the cues of :mod:`sfmapp.stereo.disparity_error`, for a plane more is a pixel of disparity more, by a
-table of swept scenes, and by how far the sparse points are off the map.
+is told by others. A slanted plane of each pixel takes it from there (:mod:`sfmapp.carve.slanted_sweep`), and what other
+maps tell is tried as well (:mod:`sfmapp.carve.sweep_exchange`). Sigma and confidence go by the cues of
+:mod:`sfmapp.stereo.disparity_error`, for a plane more is a pixel of disparity more, by a table of swept scenes, and by
+how far the sparse points are off the map.
 """
 
 from __future__ import annotations
@@ -110,6 +111,23 @@ class Planes:
 
 
 @dataclass(frozen=True)
+class SweptPlanes:
+    """Slanted planes through the pixels of a view, of which nothing is said yet.
+
+    Attributes:
+        planes: of the sweep.
+        plane: (H, W) float32 number of the plane, with fractions; NaN where nothing is believed.
+        slopes: (H, W, 2) float32 what a plane grows by from a pixel to the next, along rows and down columns.
+        neighbors: positions of the views it was swept with.
+    """
+
+    planes: Planes
+    plane: Map
+    slopes: Map
+    neighbors: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class SweptDepth:
     """Depth map of a view; arrays (H, W) float32, NaN where nothing is believed.
 
@@ -132,7 +150,7 @@ class SweptDepth:
     neighbors: tuple[int, ...]
 
 
-def sweep_view(scene: DenseScene, view_idx: int, pool: Executor | None = None) -> SweptDepth:
+def sweep_planes(scene: DenseScene, view_idx: int, pool: Executor | None = None) -> SweptPlanes:
     """Sweep planes through what a view shows.
 
     Args:
@@ -152,8 +170,9 @@ def sweep_view(scene: DenseScene, view_idx: int, pool: Executor | None = None) -
         )
     others = [scene.views[m] for m in chosen]
     planes = _planes(scene, view_idx, others)
-    plane = _slanted(reference, others, planes, pool)
-    return _measured(scene, view_idx, chosen, planes, plane)
+    anywhere, sure = _Level(reference, others, planes).answers(pool)
+    found = slanted_planes(reference, others, planes.first, planes.step, anywhere, sure, pool)
+    return believed_planes(reference, others, planes, found, np.isfinite(sure), chosen)
 
 
 def _planes(scene: DenseScene, view_idx: int, others: list[DenseView]) -> Planes:
@@ -331,21 +350,24 @@ def _box(reference: DenseView, epipole: Array, reach: float) -> tuple[int, int, 
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def _slanted(reference: DenseView, others: list[DenseView], planes: Planes, pool: Executor | None) -> Map:
-    """Planes (H, W) of the pixels that are believed, NaN elsewhere: those that correlate in the photographs that fit
-    best, or, where the sweep alone is sure, in the mean of all, and what lies close beside them."""
-    anywhere, sure = _Level(reference, others, planes).answers(pool)
-    plane, slopes, score = slanted_planes(reference, others, planes.first, planes.step, anywhere, sure, pool)
-    known = np.isfinite(sure)
+def believed_planes(
+    reference: DenseView, others: list[DenseView], planes: Planes, found: tuple[Map, Map, Map],
+    known: NDArray[np.bool_], neighbors: tuple[int, ...],
+) -> SweptPlanes:  # fmt: skip
+    """The planes of a view that correlate in the photographs that fit best, or, where they were known before, in the
+    mean of all, and what lies close beside them.
+
+    Args:
+        found: planes, slopes and scores of :func:`~sfmapp.carve.slanted_sweep.slanted_planes`.
+        known: (H, W) where the sweep alone is sure, or an earlier map is.
+    """
+    plane, slopes, score = found
     safe = np.where(known, plane, np.float32(0.0))
     grey = as_gray(reference.rgb).astype(np.float32)
     (_, here, _), _ = correlations(grey, _seen_by_others(reference, others, planes, safe), known)
     believed = (score >= LEAST_SCORE) | (known & (here >= LEAST_CORRELATION))
     take_islands(plane, slopes, believed, LEAST_ISLAND)
-    plane = carried_on(plane, slopes, believed)
-    for _ in range(_EVENED):
-        even_out(plane, np.empty_like(plane))
-    return plane
+    return SweptPlanes(planes, *carried_on(plane, slopes, believed), neighbors)
 
 
 def swept_cues(reference: DenseView, others: list[DenseView], planes: Planes, plane: Map) -> Map:
@@ -356,8 +378,11 @@ def swept_cues(reference: DenseView, others: list[DenseView], planes: Planes, pl
     return cues_of(grey, _seen_by_others(reference, others, planes, safe), safe, known)
 
 
-def _measured(scene: DenseScene, view_idx: int, chosen: tuple[int, ...], planes: Planes, plane: Map) -> SweptDepth:
-    """Depth with its sigma and confidence of the planes that are believed."""
+def measured(scene: DenseScene, view_idx: int, swept: SweptPlanes) -> SweptDepth:
+    """Depth with its sigma and confidence of the planes of a view, their scatter evened out."""
+    planes, chosen, plane = swept.planes, swept.neighbors, swept.plane.copy()
+    for _ in range(_EVENED):
+        even_out(plane, np.empty_like(plane))
     known = np.isfinite(plane)
     told = ERROR_TABLE.read(swept_cues(scene.views[view_idx], [scene.views[m] for m in chosen], planes, plane))
     residual = _residual(scene, view_idx, planes, plane, told[0])

@@ -8,9 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.plane_sweep import SweptDepth, sweep_view
+from sfmapp.carve.plane_sweep import SweptDepth, SweptPlanes, measured, sweep_planes
 from sfmapp.carve.sight import Sight, sight_of_map
 from sfmapp.carve.sweep_agreement import confirm
+from sfmapp.carve.sweep_exchange import exchange_planes
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.dense.selection import select_neighbors
 from sfmapp.errors import NoReconstructionError
@@ -64,19 +65,26 @@ def sights_by_colors(
     scene = DenseScene(tuple(views), neighbors, places, num * np.arange(len(places) + 1), seen_by)
     events.started(STAGE, f"planes through {num} photographs", total=num)
 
-    def sweep(v: int) -> SweptDepth | None:
+    def sweep(v: int) -> SweptPlanes | None:
         events.raise_if_cancelled()
         try:
-            found: SweptDepth | None = sweep_view(scene, v)
+            found: SweptPlanes | None = sweep_planes(scene, v)
         except NoReconstructionError:
             found = None
         return found
 
     with ThreadPoolExecutor(threads) as pool:
-        maps = []
-        for found in pool.map(sweep, range(num)):
-            maps.append(found)
+        swept = {}
+        for v, found in enumerate(pool.map(sweep, range(num))):
+            if found is not None:
+                swept[v] = found
             events.advanced(STAGE)
+
+        def measure(v: int) -> SweptDepth | None:
+            events.raise_if_cancelled()
+            return measured(scene, v, exchange_planes(scene, v, swept)) if v in swept else None
+
+        maps = list(pool.map(measure, range(num)))
         kept = list(pool.map(lambda v: _confirmed(scene, maps, v), range(num)))
     sights = [sight_of_map(views[v], depth) for v, depth in enumerate(kept) if depth is not None]
     if not sights:

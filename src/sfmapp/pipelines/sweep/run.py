@@ -16,13 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.plane_sweep import NEIGHBORS, Planes, SweptDepth, sweep_view
+from sfmapp.carve.plane_sweep import NEIGHBORS, Planes, SweptDepth, SweptPlanes, measured, sweep_planes
 from sfmapp.carve.sweep_agreement import confirm
+from sfmapp.carve.sweep_exchange import exchange_planes
 from sfmapp.dense.maps import depth_picture, write_cameras, write_picture
 from sfmapp.dense.photographs import find_photographs
 from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene, plan_views
 from sfmapp.dense.report import ViewsReport
-from sfmapp.dense.scene import DenseView
+from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.formats.atomic import write_array
@@ -43,7 +44,8 @@ STAGE = SWEEP
 MAPS = "maps"
 # where maps wait until others have confirmed them
 _UNCONFIRMED = "unconfirmed"
-# of a map, in the order of SweptDepth
+# of a map before others were asked, and after, in the order of SweptDepth
+_PLANES = ("plane", "slopes")
 _ARRAYS = ("depth", "sigma", "half_width_95", "confidence")
 Map = NDArray[np.float32]
 
@@ -65,12 +67,12 @@ class _Job(Job):
     """A sweep under way.
 
     Attributes:
-        plan: the views. swept: of each its map without the arrays, None where it has none.
+        plan: the views. swept: of each its planes without the arrays, None where it has none.
         left_out: photographs without a map, and why.
     """
 
     plan: DensePlan = field(init=False)
-    swept: list[SweptDepth | None] = field(default_factory=list)
+    swept: list[SweptPlanes | None] = field(default_factory=list)
     left_out: list[NamedReason] = field(default_factory=list)
 
     def waiting(self, view: int, what: str) -> Path:
@@ -120,6 +122,7 @@ def sweep(
             shutil.rmtree(job.workspace.folder / _UNCONFIRMED, ignore_errors=True)
         with job.stage(STAGE, key):
             _sweep_all(job)
+            _exchange_all(job)
         with job.stage("agreement"):
             maps = _confirm_all(job)
         shutil.rmtree(job.workspace.folder / _UNCONFIRMED, ignore_errors=True)
@@ -194,25 +197,30 @@ def _sweep_all(job: _Job) -> None:
         events.warned(STAGE, f"{len(job.left_out)} photographs have no map: {job.left_out[0].reason}")
 
 
-def _sweep_one(job: _Job, view: int, pool: ThreadPoolExecutor | None) -> SweptDepth:
-    """The map of a view, left in files: arrays first, and what says that they are whole last."""
-    wanted = np.unique([view, *_others(job.plan, view)])
-    # what is read quietly is a part of this step
-    scene = load_scene(job.plan, wanted, threads=job.threads)
-    found = sweep_view(scene, int(np.searchsorted(wanted, view)), pool)
-    arrays = found.depth, found.sigma, found.half_width_95, found.confidence
-    for what, values in zip(_ARRAYS, arrays, strict=True):
-        write_array(job.waiting(view, what), values)
+def _sweep_one(job: _Job, view: int, pool: ThreadPoolExecutor | None) -> SweptPlanes:
+    """The planes of a view, left in files: arrays first, and what says that they are whole last."""
+    scene, wanted = _around(job, view)
+    found = sweep_planes(scene, int(np.searchsorted(wanted, view)), pool)
+    # of slopes three digits are as many as planes a pixel away need
+    write_array(job.waiting(view, _PLANES[0]), found.plane)
+    write_array(job.waiting(view, _PLANES[1]), found.slopes.astype(np.float16))
     names = [int(wanted[m]) for m in found.neighbors]
     facts = {"first": found.planes.first, "step": found.planes.step, "count": found.planes.count, "neighbors": names}
     job.workspace.write_json(_facts(view), facts)
     return _without_arrays(found.planes, names)
 
 
-def _earlier(job: _Job, view: int) -> SweptDepth | None:
-    """The map that an earlier call left when it was stopped; None if there is none."""
+def _around(job: _Job, view: int) -> tuple[DenseScene, NDArray[np.int64]]:
+    """A view and those it is swept with, and their numbers, ascending."""
+    wanted = np.unique([view, *_others(job.plan, view)])
+    # what is read quietly is a part of this step
+    return load_scene(job.plan, wanted, threads=job.threads), wanted
+
+
+def _earlier(job: _Job, view: int) -> SweptPlanes | None:
+    """The planes that an earlier call left when it was stopped; None if there are none."""
     facts = job.workspace.read_json(_facts(view))
-    if facts is None or not all(job.waiting(view, what).is_file() for what in _ARRAYS):
+    if facts is None or not all(job.waiting(view, what).is_file() for what in _PLANES):
         return None
     return _without_arrays(Planes(facts["first"], facts["step"], facts["count"]), facts["neighbors"])
 
@@ -221,9 +229,42 @@ def _facts(view: int) -> str:
     return f"{_UNCONFIRMED}/{view}.json"
 
 
-def _without_arrays(planes: Planes, neighbors: Sequence[int]) -> SweptDepth:
+def _without_arrays(planes: Planes, neighbors: Sequence[int]) -> SweptPlanes:
     nothing = np.empty((0, 0), np.float32)
-    return SweptDepth(nothing, nothing, nothing, nothing, nothing, planes, tuple(neighbors))
+    return SweptPlanes(planes, nothing, nothing, tuple(neighbors))
+
+
+def _exchange_all(job: _Job) -> None:
+    """Try in every map what its neighbours' tell, and leave what is measured of it to wait in files."""
+    plan, events = job.plan, job.events
+    events.started("exchange", "planes of neighbouring maps", total=len(plan.records))
+    with ThreadPoolExecutor(1) as pool:
+        for view, swept in enumerate(job.swept):
+            events.raise_if_cancelled()
+            if swept is not None and not all(job.waiting(view, what).is_file() for what in _ARRAYS):
+                _exchange_one(job, view, pool if job.threads > 1 else None)
+            events.advanced("exchange")
+    events.finished("exchange", f"{sum(swept is not None for swept in job.swept)} maps")
+
+
+def _exchange_one(job: _Job, view: int, pool: ThreadPoolExecutor | None) -> None:
+    scene, wanted = _around(job, view)
+    at = int(np.searchsorted(wanted, view))
+    told = {place: planes for place, m in enumerate(wanted) if (planes := _planes_of(job, int(m), wanted)) is not None}
+    found = measured(scene, at, exchange_planes(scene, at, told, pool))
+    arrays = found.depth, found.sigma, found.half_width_95, found.confidence
+    for what, values in zip(_ARRAYS, arrays, strict=True):
+        write_array(job.waiting(view, what), values)
+
+
+def _planes_of(job: _Job, view: int, wanted: NDArray[np.int64]) -> SweptPlanes | None:
+    """The planes of a view, its neighbours counted among those that are loaded; None if it has none."""
+    swept = job.swept[view]
+    if swept is None:
+        return None
+    plane, slopes = (np.load(job.waiting(view, what)) for what in _PLANES)
+    near = tuple(int(np.searchsorted(wanted, m)) for m in swept.neighbors if m in wanted)
+    return SweptPlanes(swept.planes, plane, slopes.astype(np.float32), near)
 
 
 def _confirm_all(job: _Job) -> list[SweptView]:
@@ -259,7 +300,7 @@ def _confirm_all(job: _Job) -> list[SweptView]:
     return rows
 
 
-def _map(job: _Job, view: int, swept: SweptDepth) -> SweptDepth:
+def _map(job: _Job, view: int, swept: SweptPlanes) -> SweptDepth:
     depth, sigma, half_width, confidence = (np.load(job.waiting(view, what)) for what in _ARRAYS)
     return SweptDepth(depth, sigma, half_width, confidence, depth, swept.planes, swept.neighbors)
 
