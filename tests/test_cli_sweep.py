@@ -13,10 +13,12 @@ import pytest
 import sfmapp.pipelines.sweep.run as sweep_pipeline
 from dense_models import DEPTH, write_wall
 from schemas import check_schema
+from sfmapp.carve.feature_occupancy import FeatureOccupancy
 from sfmapp.carve.plane_sweep import SweptPlanes
 from sfmapp.cli.main import main
 from sfmapp.dense.scene import DenseScene
 from sfmapp.geometry import rigid3
+from sfmapp.viewer.sweep_recording import ShownMap, make_sweep_replay
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,7 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def swept(wall: Path, out: Path, *flags: str) -> int:
-    return main(["sweep", str(wall / "sparse" / "0"), "-o", str(out), *flags])
+    return main(["sweep", str(wall / "sparse" / "0"), "-o", str(out), "--no-recording", *flags])
 
 
 def test_depth_maps_of_a_wall_are_those_of_its_plane(
@@ -99,8 +101,10 @@ def test_a_call_that_was_stopped_goes_on(wall: Path, tmp_path: Path, monkeypatch
         assert path.read_bytes() == (out / "maps" / path.name).read_bytes()
 
 
-def test_page_and_occupancy(wall: Path, tmp_path: Path) -> None:
-    assert swept(wall, tmp_path / "out", "--level", "1", "--occupancy", "24", "-q") == 0
+def test_page_occupancy_and_recording(wall: Path, tmp_path: Path) -> None:
+    model, out = str(wall / "sparse" / "0"), str(tmp_path / "out")
+    assert main(["sweep", model, "-o", out, "--level", "1", "--occupancy", "24", "-q"]) == 0
+    assert (tmp_path / "out" / "recording.rrd").read_bytes()[:4] == b"RRF2"
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<img") >= 4 * 3
     assert "view_0.png" in page
@@ -112,3 +116,23 @@ def test_page_and_occupancy(wall: Path, tmp_path: Path) -> None:
         assert (volume["votes"][volume["is_feature"]] >= 3).all()
     assert (tmp_path / "out" / "occupancy.ply").is_file()
     assert swept(wall, tmp_path / "few", "--occupancy", "2", "-q") == 2
+
+
+def test_the_recording_shows_points_of_maps_where_they_are_in_the_world() -> None:
+    depth = np.full((40, 60), np.nan, np.float32)
+    depth[10:30, 20:50] = 4.0
+    pose = np.concatenate([rigid3.quaternion(np.diag([1.0, -1.0, -1.0])), [3.0, 2.0, 1.0]])
+    rgb = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    shown = ShownMap("a.png", "", rgb, depth, 0.01 * depth, np.array([50.0, 50.0, 30.0, 20.0]), pose)
+    volume = FeatureOccupancy(
+        np.array([-1.0, -2.0, -3.0]), 0.5, *np.full((2, 4, 6, 8), 5, np.uint8), np.arange(192).reshape(4, 6, 8) == 0
+    )
+    replay = make_sweep_replay("", "", [shown, shown], volume)
+    places = rigid3.apply(pose, replay.xyz[: replay.map_ptr[1]] + replay.origin)
+    np.testing.assert_allclose(places[:, 2], 4.0, atol=1e-5)
+    v, u = np.nonzero(np.isfinite(depth))
+    np.testing.assert_allclose(50.0 * places[:, 0] / 4.0 + 30.0, u + 0.5, atol=1e-3)
+    assert (replay.rgb[: replay.map_ptr[1]] == rgb[v, u]).all()
+    assert replay.map_ptr.tolist() == [0, 600, 1200]
+    np.testing.assert_allclose(replay.cell_xyz + replay.origin, [[-0.75, -1.75, -2.75]], atol=1e-5)
+    np.testing.assert_allclose(replay.box + replay.origin, [[-1.0, -2.0, -3.0], [3.0, 1.0, -1.0]], atol=1e-5)

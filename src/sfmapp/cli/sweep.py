@@ -35,6 +35,7 @@ SOURCE is a workspace of sfmapp reconstruct, or a COLMAP model with the folder o
   DIR/maps/NAME.depth.png       to look at: near is red
   DIR/maps/views.json           size, calibration and pose of each map
   DIR/report.html, report.json  the page, with pictures of the maps
+  DIR/recording.rrd             the points of one map after the other, and the volume, for the viewer of rerun
   DIR/occupancy.npz, .ply       with --occupancy: votes of the photographs' edges, and the cells that hold a feature
 A depth is kept where the map of at least one other photograph confirms it, and no more of them see through it."""
 
@@ -57,6 +58,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--occupancy", metavar="CELLS", type=int,
         help="a volume of so many cells on its longest side as well, and which of them hold edges of the photographs",
     )  # fmt: skip
+    parser.add_argument("--no-recording", action="store_true", help="do not write recording.rrd")
     parser.add_argument("--threads", metavar="N", help="default: all cores; results do not depend on it")
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_sweep)
@@ -72,8 +74,9 @@ def _sweep(args: argparse.Namespace) -> int:
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         result = sweep(
-            args.source, args.output, options, images=args.images, occupancy=args.occupancy, events=events, watch=watch
-        )
+            args.source, args.output, options, images=args.images, occupancy=args.occupancy,
+            record=not args.no_recording, events=events, watch=watch,
+        )  # fmt: skip
     tell_result(args, result, lambda: _print(result))
     return 0
 

@@ -66,6 +66,12 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
 
         write_carve_rrd(CarveReplay.load(Path(folder)), Path(output))
         return
+    if kind == "sweep":
+        from sfmapp.viewer.sweep_replay import SweepReplay
+        from sfmapp.viewer.sweep_rrd import write_sweep_rrd
+
+        write_sweep_rrd(SweepReplay.load(Path(folder)), Path(output))
+        return
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd
 

@@ -23,7 +23,7 @@ from sfmapp.viewer.replay import Replay
 if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageRecord
 
-Kind = Literal["run", "dense", "calibration", "rig", "pair", "transfer", "lines", "clouds", "stereo", "carve"]
+Kind = Literal["run", "dense", "calibration", "rig", "pair", "transfer", "lines", "clouds", "stereo", "carve", "sweep"]
 
 __all__ = [
     "Message", "RecordingListener", "RecordingReport", "Step", "draw_in_child", "record_in_child", "write_recording",

@@ -34,7 +34,7 @@ def _replay(
     confidence = np.where(np.isfinite(sigma), measured.error.confidence, np.float32(np.nan))
     maps = [
         _colored(found.disparity[::step, ::step], cv2.COLORMAP_TURBO),
-        _errors(sigma[::step, ::step]),
+        errors_in_colors(sigma[::step, ::step]),
         _colored(confidence[::step, ::step], cv2.COLORMAP_VIRIDIS, (0.0, 1.0)),
     ]
     xyz, rgb = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -45,7 +45,7 @@ def _replay(
         reach = measured.depth_sigma[measured.is_solid]
         chosen = np.arange(0, len(xyz), max(1, len(xyz) // _POINTS))
         xyz, rgb, reach = xyz[chosen], rgb[chosen], reach[chosen]
-        sigma_rgb = _errors(reach / np.maximum(xyz[:, 2], 1e-9))
+        sigma_rgb = errors_in_colors(reach / np.maximum(xyz[:, 2], 1e-9))
         of = pair.geometry
         pinhole = [of.focal * scale[0], of.cx * scale[0], of.cy * scale[1], of.doffs * scale[0]]
         baseline = float(of.baseline or 0.0)
@@ -55,8 +55,8 @@ def _replay(
     )  # fmt: skip
 
 
-def _errors(values: NDArray[np.floating]) -> Pixels:
-    """Their colours, by the logarithm."""
+def errors_in_colors(values: NDArray[np.floating]) -> Pixels:
+    """Colours of errors (...), by the logarithm, bright is large; grey where there is none."""
     return _colored(np.log(np.maximum(values, 1e-9)), cv2.COLORMAP_INFERNO)
 
 

@@ -30,6 +30,7 @@ from sfmapp.formats.atomic import write_array
 from sfmapp.formats.colmap import read_model
 from sfmapp.pipelines.dense.source import DenseSource, find_source, model_digest
 from sfmapp.pipelines.sweep.occupancy import write_occupancy
+from sfmapp.pipelines.sweep.recording import write_recording
 from sfmapp.report.stereo_pictures import SHOWN_PX
 from sfmapp.report.sweep_document import SweepReport, SweptView
 from sfmapp.report.sweep_html import MOST_SHOWN, SweptPicture, sweep_page
@@ -87,6 +88,7 @@ def sweep(
     *,
     images: str | os.PathLike[str] | None = None,
     occupancy: int | None = None,
+    record: bool = True,
     events: Events | None = None,
     watch: Stopwatch | None = None,
 ) -> SweepResult:
@@ -103,6 +105,7 @@ def sweep(
         images: folder of the photographs; None: as noted in the workspace, or where COLMAP has them.
         occupancy: write a feature-occupancy volume with so many cells on its longest side, see
             :func:`sfmapp.pipelines.sweep.occupancy.write_occupancy`; None: none.
+        record: write ``recording.rrd``, the points of one map after the other.
         events: progress, warnings and cancellation.
         watch: started when the run began.
 
@@ -135,6 +138,7 @@ def sweep(
             run=job.facts(), views=views, maps=maps, occupancy=volume, left_out=job.left_out, usage=job.usage,
             warnings=job.log.warnings,
         )  # fmt: skip
+        write_recording(job, job.plan, report, job.workspace.folder / MAPS, wanted=record)
         job.workspace.write_json(REPORT, report)
         job.workspace.write_text(PAGE, sweep_page(report, _pictures(job, maps)))
         job.workspace.save()
