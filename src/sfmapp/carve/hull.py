@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +30,16 @@ _SAMPLES, _BETWEEN = 64, 1.1
 _CHUNK = 1 << 13
 # points that are asked about together, and bits of their places along each axis by which they are put together
 _TOGETHER, _BITS = 64, 10
+
+
+class Nearest(NamedTuple):
+    """Of points (N): the least signed distances (N, K) to cones of silhouettes, ascending, units of the world, positive
+    inside, inf where there are no more; whose they are, in the order of ``Hull.fields``, -1 for none; and how many
+    views tell of each."""
+
+    distance: Array
+    view: NDArray[np.int32]
+    num_views: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -58,13 +69,16 @@ class Hull:
         is the least of all views' that see the point: exact in sign, near the surface a close bound in size. Infinite
         where nothing but ``misses`` limits it, -inf where fewer than ``min_views`` see the point.
         """
-        return self._ask(xyz, threads)[0]
+        return self._limits(self.nearest(xyz, threads))
+
+    def _limits(self, nearest: Nearest) -> Array:
+        return np.where(nearest.num_views < self.min_views, -np.inf, nearest.distance[:, -1])
 
     def normals(self, xyz: ArrayLike, step: float, threads: int | None = None) -> NDArray[np.float32]:
         """Outward unit normals (N, 3) of the hull at points (N, 3) on it: of the cone that bounds it there, by central
         differences over a step in units of the world; zero where a silhouette is flat."""
         points = np.ascontiguousarray(xyz, np.float64)
-        owners = self._ask(points, threads)[1]
+        owners = self.nearest(points, threads).view[:, -1].copy()
         out = np.empty((len(points), 3), np.float32)
 
         def run(a: int, b: int) -> None:
@@ -83,17 +97,14 @@ class Hull:
         result[:, self.order] = out
         return result
 
-    def _ask(self, xyz: ArrayLike, threads: int | None) -> tuple[Array, NDArray[np.int32]]:
-        """Distances (N,) of points (N, 3), and the views, as in ``fields``, that they are from."""
+    def nearest(self, xyz: ArrayLike, threads: int | None = None) -> Nearest:
+        """The silhouettes that points (N, 3) are least inside, one more of them than may miss."""
         points = np.ascontiguousarray(xyz, np.float64)
-        out, owners = np.empty(len(points)), np.empty(len(points), np.int32)
+        shape = len(points), self.misses + 1
+        found = Nearest(np.empty(shape), np.empty(shape, np.int32), np.empty(len(points), np.int32))
         order = _near_together(points)
-
-        def run(a: int, b: int) -> None:
-            hull_distances(self.fields, points, order[a:b], _TOGETHER, self.min_views, self.misses, out, owners)
-
-        _in_parts(run, len(points), threads)
-        return out, owners
+        _in_parts(lambda a, b: hull_distances(self.fields, points, order[a:b], _TOGETHER, *found), len(points), threads)
+        return found
 
 
 def _near_together(points: Array) -> NDArray[np.int64]:

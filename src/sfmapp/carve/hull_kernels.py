@@ -123,15 +123,15 @@ def _cube_around(xyz: Array, which: Ids) -> tuple[float, float, float, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _enter(best: Array, whose: NDArray[np.int32], d: float, view: int) -> None:
-    """Put a distance among the least ones (K,), ascending, of equal ones that of the first view."""
-    k = len(best) - 1
-    if d > best[k] or (d == best[k] and view > whose[k]):
+def _enter(best: Array, whose: NDArray[np.int32], i: int, d: float, view: int) -> None:
+    """Put a distance among the least ones of a point (N, K), ascending, of equal ones that of the first view first."""
+    k = best.shape[1] - 1
+    if d > best[i, k] or (d == best[i, k] and view > whose[i, k]):
         return
-    while k > 0 and (d < best[k - 1] or (d == best[k - 1] and view < whose[k - 1])):
-        best[k], whose[k] = best[k - 1], whose[k - 1]
+    while k > 0 and (d < best[i, k - 1] or (d == best[i, k - 1] and view < whose[i, k - 1])):
+        best[i, k], whose[i, k] = best[i, k - 1], whose[i, k - 1]
         k -= 1
-    best[k], whose[k] = d, view
+    best[i, k], whose[i, k] = d, view
 
 
 @numba.njit(cache=True, nogil=True)
@@ -140,18 +140,15 @@ def hull_distances(
     xyz: Array,
     order: Ids,
     together: int,
-    min_views: int,
-    misses: int,
     out: Array,
     owners: NDArray[np.int32],
+    seen: NDArray[np.int32],
 ) -> None:
-    """Signed distances (N,) of points (N, 3) to the hull into ``out``, and the views that they are from, or -1, into
-    ``owners``, of those that are in ``order``, so many of them together. View by view, so that what is read of a
-    picture is near to what was read before."""
-    num_views = fields.rows.shape[0]
+    """The least signed distances (N, K) of points (N, 3) to cones of silhouettes, ascending, into ``out``, the views
+    that they are from, or -1, into ``owners``, and how many views see each point, of those that are in ``order``, so
+    many of them together. View by view, so that what is read of a picture is near to what was read before."""
+    num_views, last = fields.rows.shape[0], out.shape[1] - 1
     lower, asked, whole = np.empty(num_views), np.empty(num_views, np.int64), np.empty(num_views, np.bool_)
-    best, whose = np.empty((together, misses + 1)), np.empty((together, misses + 1), np.int32)
-    seen = np.empty(together, np.int64)
     for begin in range(0, order.shape[0], together):
         which = order[begin : begin + together]
         x, y, z, half = _cube_around(xyz, which)
@@ -162,25 +159,22 @@ def hull_distances(
                 lower[num], asked[num], whole[num] = least, view, what == INSIDE
                 num_whole += what == INSIDE
                 num += 1
-        for i in range(which.shape[0]):
-            seen[i] = num_whole
-            for k in range(misses + 1):
-                best[i, k], whose[i, k] = math.inf, -1
+        for point in which:
+            seen[point] = num_whole
+            for k in range(last + 1):
+                out[point, k], owners[point, k] = math.inf, -1
         for at in np.argsort(lower[:num], kind="mergesort"):
             view, was_asked = asked[at], False
-            for i in range(which.shape[0]):
-                if lower[at] > best[i, misses]:
+            for point in which:
+                if lower[at] > out[point, last]:
                     continue
-                was_asked, point = True, which[i]
+                was_asked = True
                 d = view_distance(fields, view, xyz[point, 0], xyz[point, 1], xyz[point, 2])
                 if not math.isnan(d):
-                    seen[i] += not whole[at]
-                    _enter(best[i], whose[i], d, view)
+                    seen[point] += not whole[at]
+                    _enter(out, owners, point, d, view)
             if not was_asked:
                 break
-        for i in range(which.shape[0]):
-            out[which[i]] = -math.inf if seen[i] < min_views else best[i, misses]
-            owners[which[i]] = whose[i, misses]
 
 
 @numba.njit(cache=True, nogil=True)

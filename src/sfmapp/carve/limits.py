@@ -22,7 +22,7 @@ from sfmapp.carve.rendering import show_mesh
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View, project_point, project_points
 from sfmapp.reporting import Report
-from sfmapp.scene.mesh import Mesh, face_areas
+from sfmapp.scene.mesh import Mesh, enclosed_volume, face_areas
 from sfmapp.surface.trim import pieces
 
 Array = NDArray[np.float64]
@@ -265,28 +265,37 @@ def _next_views(mesh: Mesh, views: Sequence[View], known: Known, num: int = 3) -
     unseen = np.flatnonzero(known.kind == UNSEEN)
     found: list[NextView] = []
     for _ in range(num):
-        shown = [_faces(known, unseen, place) for place in toward]
-        gains = [float(known.areas[unseen[s]].sum()) for s in shown]
+        shown = np.empty(len(unseen), np.bool_)
+        gains = [_gain(known.centers, known.normals, known.areas, unseen, place, shown) for place in toward]
         best = int(np.argmax(gains))
         share = gains[best] / float(known.areas.sum())
         if share < _SMALLEST_HOLLOW:
             break
         found.append(NextView(place=toward[best].tolist(), gain_share=share))
-        unseen = unseen[~shown[best]]
+        _gain(known.centers, known.normals, known.areas, unseen, toward[best], shown)
+        unseen = unseen[~shown]
     return found
 
 
-def _faces(known: Known, idx: NDArray[np.int64], place: Array) -> NDArray[np.bool_]:
-    """Which triangles of some are turned towards a place."""
-    way = place - known.centers[idx]
-    along = (way * known.normals[idx]).sum(axis=1)
-    return np.asarray(along > _SMALLEST_COSINE * np.linalg.norm(way, axis=1))
+@numba.njit(cache=True, nogil=True)
+def _gain(
+    centers: Array, normals: Array, areas: Array, idx: NDArray[np.int64], place: Array, shown: NDArray[np.bool_]
+) -> float:
+    """Which triangles of some are turned towards a place, into ``shown``, and their area."""
+    total = 0.0
+    for i in range(len(idx)):
+        f = idx[i]
+        dx, dy, dz = place[0] - centers[f, 0], place[1] - centers[f, 1], place[2] - centers[f, 2]
+        along = dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2]
+        shown[i] = along > _SMALLEST_COSINE * math.sqrt(dx * dx + dy * dy + dz * dz)
+        if shown[i]:
+            total += areas[f]
+    return total
 
 
 def _volume_high(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:
     """Of the hull with its outlines farther out by three sigmas."""
-    a, b, c = (hull_mesh.xyz[hull_mesh.faces[:, k]] - hull_mesh.xyz.mean(axis=0) for k in range(3))
-    volume = float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
+    volume = enclosed_volume(hull_mesh.xyz, hull_mesh.faces)
     middle = hull_mesh.xyz.mean(axis=0)
     widths = []
     for view, silhouette in zip(views, silhouettes, strict=True):

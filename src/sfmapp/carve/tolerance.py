@@ -27,10 +27,12 @@ import dataclasses
 from collections.abc import Sequence
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
+from sfmapp.camera import lens
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.outlines import Silhouette
 from sfmapp.carve.space_carving import CarveOptions, carve_hull
@@ -142,12 +144,15 @@ def _doubted(
     names = [view.name for view in views]
     tree, _ = carve_hull(hull, names, low, side, CarveOptions(cells=_CELLS, misses=1), Events())
     points = tree.centers(np.concatenate([tree.finest_full(), tree.surface]))
-    depth, by_view = hull.distance(points), np.nan_to_num(hull.distance_by_view(points), copy=False, nan=np.inf)
+    told = hull.nearest(points)
+    least, depth = told.distance.T
+    # places that no more than one leaves out, and that one
+    whose = np.where(least > -_PASSES * tree.cell, len(views), hull.order[told.view[:, 0]])
+    held = depth > -_PASSES * tree.cell
     # taken away by one alone, by more than its outline may be wrong
-    alone = (depth > 0.0) & (by_view.min(axis=1) <= -tree.cell)
-    whose = by_view[alone].argmin(axis=1)
-    lacked = _lacked(views, silhouettes, points, by_view > -_PASSES * tree.cell, alone, tree.cell)
-    points, depth = points[alone], np.minimum(depth[alone], side)
+    alone = (depth > 0.0) & (least <= -tree.cell) & (told.num_views >= hull.min_views)
+    lacked = _lacked(views, silhouettes, _Held(points[held], whose[held], alone[held]), tree.cell)
+    points, whose, depth = points[alone], whose[alone], np.minimum(depth[alone], side)
     thickness = np.zeros(len(views))
     np.maximum.at(thickness, whose, depth)
     usual = float(np.median(thickness))
@@ -181,30 +186,58 @@ class _Taken:
     lacked: Mask
 
 
-def _lacked(
-    views: Sequence[View], silhouettes: Sequence[Silhouette], points: Array, holds: Mask, alone: Mask, cell: float
-) -> Mask:
-    """(M, V) for each place that one silhouette takes away alone, M of N in ``alone`` (N,), which others show something
-    there, and have nothing else on that ray left. ``holds``: (N, V) what each silhouette leaves."""
-    num_against = (~holds).sum(axis=1)
-    result = np.zeros((int(alone.sum()), len(views)), bool)
+@dataclasses.dataclass(frozen=True)
+class _Held:
+    """Middles of cells (N, 3) that no more than one silhouette leaves out, which one (N,), beyond the last for none,
+    and (N,) which it takes away alone."""
+
+    points: Array
+    whose: NDArray[np.int64]
+    alone: Mask
+
+
+def _lacked(views: Sequence[View], silhouettes: Sequence[Silhouette], held: _Held, cell: float) -> Mask:
+    """(M, V) for each place that one silhouette takes away alone which others show something there, and have nothing
+    else on that ray left."""
+    points, whose = held.points[held.alone], held.whose[held.alone]
+    result = np.zeros((len(points), len(views)), bool)
     for i, (view, silhouette) in enumerate(zip(views, silhouettes, strict=True)):
-        others = num_against - ~holds[:, i]
-        radius = float(_radius(view, points[:: max(1, len(points) // _SAMPLES)], cell).max(initial=0.0))
+        radius = float(_radius(view, held.points[:: max(1, len(held.points) // _SAMPLES)], cell).max(initial=0.0))
         # a grid on which a cell covers a few points
         step = max(1, int(radius) // 2)
         distance = silhouette.distance[step // 2 :: step, step // 2 :: step]
+        covered = np.zeros(distance.shape, np.uint8)
+        _cover(view.row, held.points, held.whose, (i, len(views)), np.array([view.height, view.width, step]), covered)
+        covered = cv2.dilate(covered, _disk(max(1, int(np.ceil(radius / step)))))
+        lacks = (distance > _MARGIN_PX + 0.5 * (step - 1)) & (covered == 0)
+        if silhouette.known is not None:
+            lacks &= silhouette.known[step // 2 :: step, step // 2 :: step]
         rows, columns = (
             np.minimum(at // step, n - 1) for at, n in zip(_pixels(view, points), distance.shape, strict=True)
         )
-        held = np.zeros(distance.shape, np.uint8)
-        held[rows[others == 0], columns[others == 0]] = 1
-        held = cv2.dilate(held, _disk(max(1, int(np.ceil(radius / step)))))
-        lacks = (distance > _MARGIN_PX + 0.5 * (step - 1)) & (held == 0)
-        if silhouette.known is not None:
-            lacks &= silhouette.known[step // 2 :: step, step // 2 :: step]
-        result[:, i] = lacks[rows[alone], columns[alone]] & holds[alone, i]
+        result[:, i] = lacks[rows, columns] & (whose != i)
     return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _cover(
+    row: Array, points: Array, whose: NDArray[np.int64], of: tuple[int, int], size: NDArray[np.int64],
+    covered: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Mark the pictures of points (N, 3) of either of two, on a grid of every so many pixels; ``size``: height, width
+    and step. What is beyond the picture is at its edge."""
+    optics = row[12:]
+    for n in range(points.shape[0]):
+        if whose[n] != of[0] and whose[n] != of[1]:
+            continue
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a = row[0] * x + row[1] * y + row[2] * z + row[3]
+        b = row[4] * x + row[5] * y + row[6] * z + row[7]
+        c = row[8] * x + row[9] * y + row[10] * z + row[11]
+        u, v = lens.project(optics, a, b, c)
+        line = int(min(max(v, 0.0), size[0] - 1.0)) if v == v else 0
+        col = int(min(max(u, 0.0), size[1] - 1.0)) if u == u else 0
+        covered[min(line // size[2], covered.shape[0] - 1), min(col // size[2], covered.shape[1] - 1)] = 1
 
 
 def _pixels(view: View, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -21,7 +21,7 @@ from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.report.carve_document import BoxFacts, CarveReport, SurfaceFacts
 from sfmapp.report.carve_html import Shape, carve_page
 from sfmapp.reporting import NamedReason
-from sfmapp.scene.mesh import Mesh, face_areas
+from sfmapp.scene.mesh import Mesh, enclosed_volume, face_areas
 from sfmapp.surface.report import TextureReport
 from sfmapp.viewer.carve_recording import record_carving
 from sfmapp.workspace.job import FAILED, NOT_WANTED, WRITTEN, Job
@@ -147,10 +147,9 @@ def _level_text(level: LevelCounts) -> str:
 
 
 def _facts(mesh: Mesh) -> SurfaceFacts:
-    """Size of a closed mesh, by the divergence theorem."""
-    a, b, c = (mesh.xyz[mesh.faces[:, corner]] - mesh.xyz.mean(axis=0) for corner in range(3))
+    """Size of a closed mesh."""
     return SurfaceFacts(
         num_vertices=len(mesh.xyz), num_faces=len(mesh.faces), low=mesh.xyz.min(axis=0).tolist(),
         high=mesh.xyz.max(axis=0).tolist(), area=float(face_areas(mesh.xyz, mesh.faces).sum()),
-        volume=float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0),
+        volume=enclosed_volume(mesh.xyz, mesh.faces),
     )  # fmt: skip
