@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,11 @@ from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
+from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.refinement import calibration_check
 from sfmapp.odometry.refinement.calibration_check import Unknowns, _changed
+from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.scene.rig import Rig
 
@@ -231,3 +234,41 @@ def test_where_nothing_makes_a_wrong_calibration_better_the_map_is_red_and_open(
     assert contradiction.subject == "given calibration"
     assert contradiction.position_sigma_share >= 1.0
     assert contradiction.rotation_sigma_deg >= 180.0
+
+
+def test_what_a_map_gains_while_its_calibration_is_questioned_is_brought_along() -> None:
+    ground_truth, given = rig_of(lens()), rig_of(lens(1.02))
+    keyframes, poses = drive(ground_truth, given, bend=0.04, num=21)
+    adjust_finally(keyframes, replace(OPTIONS, refine_camera=False), Events())
+    later = [keyframes.remove(18) for _ in range(3)]
+    local = LocalMap(given, OPTIONS, None, 0)
+    local.keyframes = keyframes
+    with ThreadPoolExecutor(1) as executor:
+        calibration = EarlyCalibration(True, executor)
+        assert not calibration.refines(local, 18)
+        assert calibration.is_asking
+        for number, keyframe in enumerate(later, 19):
+            keyframes.append(keyframe)
+            assert not calibration.refines(local, number)  # answered or not
+        assert local.rig is given
+        assert calibration.refines(local, 18 + 10)
+    assert not calibration.is_open
+    assert not calibration.is_asking
+    assert keyframes.rig is local.rig
+    assert local.rig.cameras[0].focal == pytest.approx(FOCAL, rel=5e-3)
+    assert errors(keyframes, poses)[1] < 0.05
+    model, _ = keyframes.reconstruction(np.arange(21))
+    off = np.linalg.norm(model.residuals_px(), axis=1)[model.obs_is_inlier & (model.tracks.obs_image_idx >= 18)]
+    assert np.median(off) < 2 * NOISE_PX
+
+
+def test_a_question_is_forgotten_with_the_map_that_it_was_asked_of() -> None:
+    given = rig_of(lens(1.02))
+    local = LocalMap(given, OPTIONS, None, 0)
+    local.keyframes, _ = drive(rig_of(lens()), given, bend=0.04, num=18)
+    adjust_finally(local.keyframes, replace(OPTIONS, refine_camera=False), Events())
+    calibration = EarlyCalibration(True, None)
+    calibration.refines(local, 18)
+    calibration.forget()
+    assert not calibration.refines(local, 40)
+    assert local.rig is given

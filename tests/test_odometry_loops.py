@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -199,13 +200,15 @@ def test_places_find_the_revisit(walked: tuple[KeyframeMap, PlaceIndex], wall: W
 def test_places_are_small_and_the_same_twice(wall: Wall) -> None:
     rng = np.random.default_rng(0)
     tables = []
-    for _ in range(2):
-        places = PlaceIndex(PlaceOptions(learn_after=4))
+    for executor in (None, ThreadPoolExecutor(1)):
+        places = PlaceIndex(PlaceOptions(learn_after=4), executor=executor)
         rng = np.random.default_rng(0)
         for n in range(20):
             image = rng.integers(0, 255, (60, 80), np.uint8)
             ids = np.arange(1000)
             places.add(0, n, image, rng.uniform(5, 55, (1000, 2)), ids)
+            # learnt from four places, and taken over with the sixth, however long that has taken
+            assert (places._words is None) == (n < 5)
         kept = places[3]
         size = kept.point_id.nbytes + kept.xy.nbytes + kept.descriptors.nbytes + places._vectors[0].nbytes
         assert size < 100_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +41,13 @@ class Recognition:
 
     Attributes:
         num_ambiguous: frames that might have been at several places of a known map.
+
+    Args:
+        executor: where vocabularies are learnt; None: in the thread that calls.
     """
 
-    def __init__(self, seed: int) -> None:
-        self._places, self._finder = PlaceIndex(seed=seed), LoopFinder()
+    def __init__(self, seed: int, executor: Executor | None = None) -> None:
+        self._places, self._finder = PlaceIndex(seed=seed, executor=executor), LoopFinder()
         self._num_searches, self.num_ambiguous = 0, 0
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0

@@ -104,15 +104,17 @@ class Odometry:
         if known is not None:  # its points were made with the cameras as they are: a refined one would not fit them
             options = replace(options, refine_camera=False)
         self.rig, self.options, self.seed, self.events = sequence.rig, options, seed, events
-        self.given_rig, self.calibration = sequence.rig, EarlyCalibration(options.refine_camera)
-        self.executor = ThreadPoolExecutor(1, "adjust") if threads > 1 else None
+        self.given_rig = sequence.rig
+        # windows; and, seldom, a vocabulary and the calibration, neither of which may keep a window waiting
+        self.executor = ThreadPoolExecutor(3, "adjust") if threads > 1 else None
+        self.calibration = EarlyCalibration(options.refine_camera, self.executor)
         self.state, self.counts = RunState(), _Counts()
         self.records: list[FrameRecord] = []
         self.imu = sequence.imu if with_imu else None
         # a rig holds rotations well enough
         self.atlas = Atlas(options, self.executor, None if self.rig.is_stereo else self.imu)
         self.local: LocalMap | None = None  # the map that the camera is in, or was in when it was lost
-        self.recognition, self.keyframe_images = Recognition(seed), KeyframeImages(markers)
+        self.recognition, self.keyframe_images = Recognition(seed, self.executor), KeyframeImages(markers)
         self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
         self.clock = StereoClock(self.rig)
         self.known = None if known is None else self._enter_known_map(known)
@@ -291,7 +293,7 @@ class Odometry:
         local = self.local
         assert local is not None
         before = local.pose(local.newest)
-        if not self.calibration.refines(local):
+        if not self.calibration.refines(local, len(self.records)):
             return
         self.rig, pose = local.rig, local.pose(local.newest)
         record.give_out(pose)
@@ -302,7 +304,7 @@ class Odometry:
 
     def _cull(self, local: LocalMap) -> None:
         """Drop a keyframe that adds nothing, once it has left the window."""
-        position = local.redundant_keyframe()
+        position = None if self.calibration.is_asking else local.redundant_keyframe()
         if position is None or not self.recognition.forget(local.keyframes.keyframes[position].frame_idx):
             return
         dropped = local.remove_keyframe(position)
@@ -416,6 +418,7 @@ class Odometry:
         closure = self.recognition.remember(maps, local, view, mapped.xy, mapped.point_id)
         if closure is None:
             return
+        self.calibration.forget()
         for number in {closure.old_map, closure.new_map}:
             maps[number].backend.finish(maps[number].keyframes)
         self.local, scale = self.recognition.close(maps, self.records, closure)

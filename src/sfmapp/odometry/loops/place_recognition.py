@@ -6,14 +6,16 @@ their own; an image that asks describes its corners at three scales and at a giv
 of scale from 0.7 to 1.4 (measured: 1.3 to 1.7 times the matches of dominant orientations in driving, and three times
 those of ORB under a roll of 10 degrees).
 
-A vocabulary is learnt from the first keyframes, and again whenever there are four times as many; every keyframe is one
-VLAD vector over it (see :mod:`sfmapp.matching.pairs`, whose sums over whole numbers are the same on any machine).
+A vocabulary is learnt from the first keyframes, and again whenever there are four times as many, in a thread beside the
+tracking, which takes it over a fixed number of places later; every keyframe is one VLAD vector over it (see
+:mod:`sfmapp.matching.pairs`, whose sums over whole numbers are the same on any machine).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import numba
@@ -39,6 +41,8 @@ _BLUR_PX, _LEVEL_SIGMA_PX, _NUM_LEVELS = 1.5, 2.6, 2
 _SIGMA_RANGE_PX = (1.6, _LEVEL_SIGMA_PX * 2 ** (_NUM_LEVELS - 1))
 # Descriptors that a vocabulary is learnt from, in all: 250 for each of 64 words.
 _SAMPLE_SIZE = 16384
+# Places after which a vocabulary counts that it took so many to begin with: it takes 0.1 to 0.2 s.
+_LAG = 2
 # Places that stand for one: of neighbours in time only the most similar is a candidate.
 _ISLAND = 3
 _BLOCK = 256
@@ -50,7 +54,7 @@ class PlaceOptions:
 
     max_points: int = 400  # points described per keyframe, those followed longest; 128 bytes each
     num_words: int = 64  # size of the vocabulary; 256 bytes a word and keyframe
-    learn_after: int = 10  # keyframes after which the vocabulary is learnt first
+    learn_after: int = 8  # keyframes after which the vocabulary is learnt first
     min_similarity: float = 0.3  # least similarity of a candidate, in those of keyframes that follow each other (DBoW2)
     num_candidates: int = 3  # places tried for one image, at most
 
@@ -128,15 +132,32 @@ class Candidate:
     similarity: float
 
 
+@dataclass(frozen=True)
+class _Vocabulary:
+    """What was learnt from places.
+
+    Attributes:
+        words: (W, 128) float32. vectors: of the places that it was learnt from, by their frames.
+    """
+
+    words: Floats
+    vectors: dict[int, NDArray[np.int16]]
+
+
 class PlaceIndex:
     """All keyframes of all maps, by frame number: that of a keyframe stays the same when others are dropped or joined.
 
     What is found depends on the order of the calls alone. One thread at a time.
+
+    Args:
+        executor: where vocabularies are learnt; None: in the thread that calls.
     """
 
-    def __init__(self, options: PlaceOptions = PlaceOptions(), seed: int = 0) -> None:
+    def __init__(self, options: PlaceOptions = PlaceOptions(), seed: int = 0, executor: Executor | None = None) -> None:
         self.options = options
-        self._seed = seed
+        self._seed, self._executor = seed, executor
+        self._future: Future[_Vocabulary] | None = None
+        self._num_added, self._due = 0, 0
         self._places: list[Place] = []
         self._row: dict[int, int] = {}
         self._words: Floats | None = None
@@ -170,10 +191,13 @@ class PlaceIndex:
         place = Place(map_idx, frame_idx, np.array(point_id[kept]), view.xy[kept].astype(np.float32), described)
         self._row[frame_idx] = len(self._places)
         self._places.append(place)
-        if len(self._places) >= max(self.options.learn_after, 4 * self._num_learnt):
-            self._learn()
+        self._num_added += 1
+        if self._future is not None and self._num_added >= self._due:
+            self._take_over(self._future.result())
         elif self._words is not None:
             self._embed(len(self._places) - 1)
+        if self._future is None and len(self._places) >= max(self.options.learn_after, 4 * self._num_learnt):
+            self._begin_to_learn()
         return view
 
     def query(self, frame_idx: int, exclude: Collection[int] = (), *, other_maps: bool = False) -> list[Candidate]:
@@ -234,32 +258,32 @@ class PlaceIndex:
     def learn(self) -> None:
         """Learn a vocabulary from the places so far, however few, if there is none: all of a map are known at once."""
         if self._words is None and self._places:
-            self._learn()
+            self._num_learnt = len(self._places)
+            self._take_over(_learn(self._places, self.options, self._seed))
 
-    def _learn(self) -> None:
-        """Learn a vocabulary from all places so far and embed them again."""
-        self._num_learnt = len(self._places)
-        share = max(1, _SAMPLE_SIZE // self._num_learnt)
-        rng = np.random.default_rng([self._seed, 0x706C6163, self._num_learnt])
-        samples = []
-        for place in self._places:
-            few = np.sort(rng.permutation(len(place.descriptors))[:share])
-            samples.append(
-                Features(np.zeros((len(few), 4), np.float32), place.descriptors[few], np.zeros((0, 3), np.uint8))
-            )
-        options = PairOptions(num_words=self.options.num_words, num_query_features=share)
-        self._words = learn_vocabulary(samples, options, seed=self._seed)
-        self._vectors = np.zeros((2 * self._num_learnt, self._words.size), np.int16)
-        self._reference = np.full(2 * self._num_learnt, np.nan)
-        for row in range(len(self._places)):
-            self._embed(row)
+    def _begin_to_learn(self) -> None:
+        """Learn a vocabulary from all places so far, to be taken over when there are a few more."""
+        self._num_learnt, self._due = len(self._places), self._num_added + _LAG
+        if self._executor is not None:
+            self._future = self._executor.submit(_learn, list(self._places), self.options, self._seed)
+        else:
+            self._future = Future()
+            self._future.set_result(_learn(self._places, self.options, self._seed))
 
-    def _embed(self, row: int) -> None:
+    def _take_over(self, learnt: _Vocabulary) -> None:
+        """Go by another vocabulary from now on."""
+        self._future, self._words = None, learnt.words
+        self._vectors = np.zeros((2 * len(self._places), learnt.words.size), np.int16)
+        self._reference = np.full(2 * len(self._places), np.nan)
+        for row, place in enumerate(self._places):
+            self._embed(row, learnt.vectors.get(place.frame_idx))
+
+    def _embed(self, row: int, vector: NDArray[np.int16] | None = None) -> None:
         assert self._words is not None
         if row == len(self._vectors):
             self._vectors = np.concatenate([self._vectors, np.zeros_like(self._vectors)])
             self._reference = np.concatenate([self._reference, np.full(row, np.nan)])
-        self._vectors[row] = _vector(self._places[row].descriptors, self._words)
+        self._vectors[row] = _vector(self._places[row].descriptors, self._words) if vector is None else vector
         before = row > 0 and self._places[row - 1].map_idx == self._places[row].map_idx
         self._reference[row] = (
             _similarities(self._vectors[row - 1 : row], self._vectors[row])[0] if before else math.nan
@@ -288,6 +312,22 @@ class PlaceIndex:
             for other in range(max(0, row - _ISLAND), min(len(taken), row + _ISLAND + 1)):
                 taken[other] |= self._places[other].map_idx == place.map_idx
         return found
+
+
+def _learn(places: Sequence[Place], options: PlaceOptions, seed: int) -> _Vocabulary:
+    """A vocabulary of places, and their vectors over it."""
+    share = max(1, _SAMPLE_SIZE // len(places))
+    rng = np.random.default_rng([seed, 0x706C6163, len(places)])
+    samples = []
+    for place in places:
+        few = np.sort(rng.permutation(len(place.descriptors))[:share])
+        samples.append(
+            Features(np.zeros((len(few), 4), np.float32), place.descriptors[few], np.zeros((0, 3), np.uint8))
+        )
+    words = learn_vocabulary(
+        samples, PairOptions(num_words=options.num_words, num_query_features=share), seed=seed
+    )  # fmt: skip
+    return _Vocabulary(words, {place.frame_idx: _vector(place.descriptors, words) for place in places})
 
 
 @numba.njit(cache=True, nogil=True)
