@@ -4,6 +4,7 @@ asked.
     python benchmarks/odometry.py                     # kitti00-200 forward, in steps of two, backwards; rendered ones
     python benchmarks/odometry.py --rendered 0 --peer # real data alone, and pycolmap on every second frame (minutes)
     python benchmarks/odometry.py FOLDER ...          # sequences with a ground truth: KITTI, TUM, EuRoC
+    python benchmarks/odometry.py --kitti DIR --euroc DIR --tum DIR   # all that are there, in the tables of papers
 
 The command runs as a process of its own with its default options, without a recording; wall seconds, CPU seconds (user
 and system, children included) and peak resident memory are those of the process, its start and its imports included.
@@ -29,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from machine import RESULTS, ROOT, describe_machine
+from published_sequences import find_published, published_tables
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
@@ -56,6 +58,8 @@ class Case:
 
 def find_cases(args: argparse.Namespace) -> list[Case]:
     """The given sequences; without any, kitti00-200 in three ways and the rendered ones."""
+    if args.published:
+        return [Case(sequence.name, sequence.folder, sequence.flags) for sequence in args.published]
     if args.folders:
         return [Case(folder.resolve().name, folder) for folder in args.folders]
     cases = []
@@ -296,6 +300,10 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folders", nargs="*", type=Path, help="sequences; default: kitti00-200 and rendered ones")
+    for name, text in (("kitti", "KITTI odometry"), ("euroc", "EuRoC MAV"), ("tum", "TUM RGB-D")):
+        parser.add_argument(
+            f"--{name}", type=Path, metavar="DIR", help=f"play what is there of {text}; mono and stereo"
+        )
     parser.add_argument(
         "--repeats", type=int, default=2, help="runs of each case; two tell whether the bytes are the same"
     )
@@ -307,10 +315,17 @@ def main() -> None:
     parser.add_argument("--only", action="append", metavar="TEXT", help="only the cases with this in their names")
     parser.add_argument("--peer", action="store_true", help="pycolmap as well, on every second frame: minutes")
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
-    parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/odometry.json")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=None,
+        help="default: benchmarks/results/odometry.json; of --kitti, --euroc, --tum: out/published.json",
+    )
     args = parser.parse_args()
+    args.published = find_published(args.kitti, args.euroc, args.tum)
     report: dict[str, Any] = environment(args) | {"runs": []}
-    output = args.output or RESULTS / "odometry.json"
+    output = args.output or (ROOT / "out" / "published.json" if args.published else RESULTS / "odometry.json")
     output.parent.mkdir(parents=True, exist_ok=True)
     cases = [case for case in find_cases(args) if not args.only or any(text in case.name for text in args.only)]
     if not cases:
@@ -328,6 +343,8 @@ def main() -> None:
         report["rows"] = summaries(report["runs"])
         output.write_text(json.dumps(report, indent=1) + "\n")
     text = markdown(report)
+    if args.published:
+        text += "\n\n" + published_tables(args.published, report["rows"])
     output.with_suffix(".md").write_text(text + "\n")
     print(text)
 
