@@ -113,6 +113,22 @@ def test_views_that_are_not_asked_are_no_nearer(lens: str, misses: int) -> None:
     assert hull.distance(points[::-1])[::-1].tobytes() == found.tobytes()
 
 
+@pytest.mark.parametrize(("width", "most"), [(64, 64), (200, 128), (400, 256)])
+def test_no_point_of_a_smooth_solid_is_farther_outside_than_a_cell(width: int, most: int) -> None:
+    views = around(8, width=width, height=width)
+    rng = np.random.default_rng(2)
+    way = rng.normal(size=(4000, 3))
+    points = 0.9 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    silhouettes = [dataclasses.replace(silhouette_of(view, ball(0.9)), outline_sigma_px=0.2) for view in views]
+    tree, report = carve(views, silhouettes, np.full(3, -0.95), 1.9)
+    assert report.cells == most
+    outside = -float(hull_of(views, silhouettes).distance(points).min())
+    assert 0.0 < outside < tree.cell
+    # and cells are not much larger than what whole pixels tell
+    if most < 256:
+        assert tree.cell < 5.0 * outside
+
+
 def test_any_number_of_threads_gives_the_same_bytes() -> None:
     views = around(6)
     silhouettes = [silhouette_of(view, ball()) for view in views]

@@ -18,7 +18,7 @@ from sfmapp.carve.hull_kernels import cone_slopes, hull_distances, view_distance
 from sfmapp.carve.octree import codes_in_box
 from sfmapp.carve.parts import in_parts
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.views import View
+from sfmapp.carve.views import View, project_points
 from sfmapp.errors import InputError
 
 Array = NDArray[np.float64]
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 # samples along the longer side of a picture from which a lens's largest slope is taken, and what is added to it for
 # slopes between the samples: a lens of which it is more changes its focal length by a tenth within a 64th of a picture
 _SAMPLES, _BETWEEN = 64, 1.1
+# outlines are believed within so many of their standard deviations
+_SIGMAS = 3.0
 # points for a thread at a time: few enough that neighbours are read together
 _CHUNK = 1 << 13
 # points that are asked about together, and bits of their places along each axis by which they are put together
@@ -179,6 +181,20 @@ def hull_of(
     num_telling = sum(s.known is None or bool(s.known.any()) for s in silhouettes)
     least = max(2, (num_telling + 1) // 2) if min_views is None else min_views
     return Hull(fields, np.array(order), min(least, len(views)), misses)
+
+
+def outline_error(views: Sequence[View], silhouettes: Sequence[Silhouette], at: Array) -> float:
+    """How far the hull's surface may be off beside a place (3,) by what outlines may be, three of their standard
+    deviations in the typical view, units of the world."""
+    errors = []
+    for view, silhouette in zip(views, silhouettes, strict=True):
+        # a step across the axis by a small share of the depth
+        across = np.linalg.svd(view.axis[None])[2][1]
+        depth, here = float(np.linalg.norm(at - view.center)), np.empty((2, 3))
+        project_points(view.row, np.stack([at, at + 1e-3 * depth * across]), here)
+        px = float(np.linalg.norm(here[1, :2] - here[0, :2]))
+        errors.append(_SIGMAS * silhouette.outline_sigma_px * 1e-3 * depth / px)
+    return float(np.nanmedian(errors)) if np.isfinite(errors).any() else 0.0
 
 
 def _steps(distance: ArrayLike) -> NDArray[np.int16]:

@@ -16,11 +16,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.carve.hull import outline_error
 from sfmapp.carve.joined import Evidence, cast_votes
 from sfmapp.carve.joined_kernels import BINS
 from sfmapp.carve.rendering import show_mesh
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.views import View, project_point, project_points
+from sfmapp.carve.views import View, project_point
 from sfmapp.reporting import Report
 from sfmapp.scene.mesh import Mesh, enclosed_volume, face_areas
 from sfmapp.surface.trim import pieces
@@ -296,17 +297,8 @@ def _gain(
 def _volume_high(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:
     """Of the hull with its outlines farther out by three sigmas."""
     volume = enclosed_volume(hull_mesh.xyz, hull_mesh.faces)
-    middle = hull_mesh.xyz.mean(axis=0)
-    widths = []
-    for view, silhouette in zip(views, silhouettes, strict=True):
-        here = np.empty((2, 3))
-        # a step across the axis by a small share of the depth
-        across = np.linalg.svd(view.axis[None])[2][1]
-        depth = float(np.linalg.norm(middle - view.center))
-        project_points(view.row, np.stack([middle, middle + 1e-3 * depth * across]), here)
-        px = float(np.linalg.norm(here[1, :2] - here[0, :2]))
-        widths.append(_SIGMAS * silhouette.outline_sigma_px * 1e-3 * depth / px)
-    return volume + float(np.median(widths)) * float(face_areas(hull_mesh.xyz, hull_mesh.faces).sum())
+    error = outline_error(views, silhouettes, hull_mesh.xyz.mean(axis=0))
+    return volume + error * float(face_areas(hull_mesh.xyz, hull_mesh.faces).sum())
 
 
 def _area_low(hull_mesh: Mesh, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> float:

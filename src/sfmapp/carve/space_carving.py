@@ -10,13 +10,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.carve.carving_kernels import Cells, split
-from sfmapp.carve.hull import Hull, hull_of
+from sfmapp.carve.hull import Hull, hull_of, outline_error
 from sfmapp.carve.octree import MAX_DEPTH, Codes, Octree, codes_of
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
@@ -28,6 +28,8 @@ from sfmapp.reporting import Report
 STAGE = "carve"
 # level of the subtrees that threads take: up to 512, enough for many threads and few enough to cost nothing
 _SUBTREES = 3
+# cells along the side, at most, of which no number is asked for
+_MOST_CELLS = 256
 # side of the grid of points on which it is found out why nothing is left
 _COARSE = 48
 _RANGES = {"cells": Range(2, 2.0**MAX_DEPTH), "min_views": Range(1), "misses": Range(0, 64)}
@@ -39,7 +41,8 @@ class CarveOptions:
     """Options of space carving.
 
     Attributes:
-        cells: finest cells along the side of the cube, rounded up to a power of two.
+        cells: finest cells along the side of the cube, rounded up to a power of two; None: as fine as outlines are
+            told, see :func:`told_cells`, and 256 at most.
         min_views: photographs that have to look at a place for anything to be left there; None: half of them. Where
             fewer look, as beyond the pictures of most, their cones would be left standing; how much was taken away for
             that is in the report.
@@ -48,7 +51,7 @@ class CarveOptions:
             :mod:`sfmapp.carve.tolerance`. A gap of the object that one photograph alone looks through is filled.
     """
 
-    cells: int = 256
+    cells: int | None = None
     min_views: int | None = None
     misses: int = 0
     doubts_holes: bool = True
@@ -58,8 +61,8 @@ class CarveOptions:
 
     @property
     def depth(self) -> int:
-        """Level of the finest cells."""
-        return int(self.cells - 1).bit_length()
+        """Level of the finest cells, the most where their number is not given."""
+        return int((self.cells or _MOST_CELLS) - 1).bit_length()
 
 
 class LevelCounts(Report):
@@ -133,8 +136,16 @@ def carve(
         NoReconstructionError: nothing is left; it says which photographs are to blame.
     """
     options = options or CarveOptions()
+    if options.cells is None:
+        options = replace(options, cells=told_cells(outline_error(views, silhouettes, np.add(low, 0.5 * side)), side))
     hull = hull_of(views, silhouettes, min_views=options.min_views, misses=options.misses)
     return carve_hull(hull, [view.name for view in views], low, side, options, events or Events(), threads)
+
+
+def told_cells(error: float, side: float) -> int:
+    """How many cells along the side of a cube outlines tell apart, a power of two: each as large as what the hull's
+    surface may be off, units of the world, so that what is smooth is no farther outside than one; 256 at most."""
+    return int(2 ** np.clip(np.floor(np.log2(side / max(error, 1e-9 * side))), 1, np.log2(_MOST_CELLS)))
 
 
 def carve_hull(

@@ -62,7 +62,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--lights", metavar="FILE", help="JSON file of photographs under single lights, whose shadows carve hollows"
     )
     volume = parser.add_argument_group("volume")
-    volume.add_argument("--cells", metavar="N", help="finest cells along the longest side; default: 256")
+    volume.add_argument(
+        "--cells", metavar="N", help="finest cells along the longest side; default: as outlines tell, 256 at most"
+    )
     volume.add_argument(
         "--box", metavar=("X", "Y", "Z", "X", "Y", "Z"), type=float, nargs=6,
         help="lower and upper corners of the box that the object is in; default: as the silhouettes say",

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.box import Box, clip_octree, tightened
 from sfmapp.carve.files import read_octree, write_octree
-from sfmapp.carve.hull import Hull, hull_of
+from sfmapp.carve.hull import Hull, hull_of, outline_error
 from sfmapp.carve.isosurface import Distance, Normals
 from sfmapp.carve.octree import Octree
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarvingReport, carve_hull
+from sfmapp.carve.space_carving import CarveOptions, CarvingReport, carve_hull, told_cells
 from sfmapp.carve.swept_sights import SightsReport
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
@@ -114,7 +114,7 @@ def _carve(
     if found is not None:
         return hull, *found
     with job.stage(STAGE, key):
-        octree, report = _carved(job, source, hull, box)
+        octree, report = _carved(job, source, silhouettes, hull, box)
         job.events.raise_if_cancelled()
         write_octree(folder / OCTREE, octree)
         job.workspace.write_json(CARVING, report)
@@ -122,13 +122,16 @@ def _carve(
     return hull, octree, report
 
 
-def _carved(job: Job, source: CarveSource, hull: Hull, box: Box) -> tuple[Octree, CarvingReport]:
+def _carved(
+    job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], hull: Hull, box: Box
+) -> tuple[Octree, CarvingReport]:
     """The volume in a box that a user gave; in one that silhouettes tell, which is loose, in what a coarse volume fills
     of it."""
     names, options = [view.name for view in source.views], job.options.carve
-    if box.told_by != "user" and options.cells > _COARSE:
+    if box.told_by != "user" and 2**options.depth > _COARSE:
         coarse, _ = carve_hull(hull, names, *box.cube(), replace(options, cells=_COARSE), Events(), threads=job.threads)
         box = tightened(box, coarse)
+    options = _with_cells(job, source, silhouettes, box)
     try:
         octree, report = carve_hull(hull, names, *box.cube(), options, job.events, threads=job.threads)
     except NoReconstructionError:
@@ -139,6 +142,20 @@ def _carved(job: Job, source: CarveSource, hull: Hull, box: Box) -> tuple[Octree
         low, high = octree.volume_bounds()
         report = replace(report, volume_low=low, volume_high=high)
     return octree, report
+
+
+def _with_cells(job: Job, source: CarveSource, silhouettes: Sequence[Silhouette], box: Box) -> CarveOptions:
+    """The options, with a number of cells: what was asked for, or what outlines tell apart."""
+    options, (low, side) = job.options.carve, box.cube()
+    error = outline_error(source.views, silhouettes, low + 0.5 * side)
+    told, most = told_cells(error, side), 2**options.depth
+    if options.cells is None:
+        options = replace(options, cells=told)
+    if told < most:
+        said = f"outlines are told to {error:.3g} (three standard deviations), as large as {side / error:.0f} cells"
+        asked = "are asked for: the finest tell no more" if told < 2**options.depth else "are taken"
+        job.events.decided(STAGE, f"{said} along the side: {2**options.depth} {asked}")
+    return options
 
 
 def _digest(silhouettes: Sequence[Silhouette]) -> str:
