@@ -64,6 +64,7 @@ INNER_FLOORS = {
         ("records",),
         ("tracker", "initialize", "stereo_clock"),
         ("refinement",),
+        ("belief",),
         ("loops",),
         ("map",),
         ("frontend",),

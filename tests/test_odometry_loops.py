@@ -36,6 +36,7 @@ Array = np.ndarray
 
 CAMERA = simple_camera(CameraModel.SIMPLE_PINHOLE, 320, 240, 280.0)
 PX_PER_M = 80.0
+UNSURE = np.full((6, 6), np.nan)
 OPTIONS = RelocalizeOptions()
 
 
@@ -273,7 +274,7 @@ def test_recognition_remembers_what_is_new_and_finds_lost_frames_roll_by_roll(wa
         keyframe = walker.step(n, pose_at(4.0 + 0.3 * n, 4.0))
         local.newest = n
         view = frame_of(n, walker.images[n])
-        assert recognition.remember(maps, local, view, keyframe.xy[:, 0], keyframe.point_id) is None
+        assert recognition.remember(maps, local, view, keyframe.xy[:, 0], keyframe.point_id, UNSURE) is None
     places = recognition._places
     known = sorted(places._row)
     assert known[0] == 0

@@ -122,6 +122,14 @@ class WorldBuilder:
         self.quad((-hx, hy, 0), (2 * hx, 0, 0), (0, -2 * hy, 0), floor)
         self.quad((-hx, -hy, height), (2 * hx, 0, 0), (0, 2 * hy, 0), ceiling)
 
+    def repeat_turned(self) -> None:
+        """Everything so far once more, turned by half about the world's z axis, lit as its like is."""
+        for row in self._rows[:]:
+            turned = list(row)
+            for k in (0, 3, 6):  # the corner and both edges
+                turned[k], turned[k + 1] = -row[k], -row[k + 1]
+            self._rows.append(turned)
+
     def build(self) -> World:
         """The world so far."""
         rows = np.array(self._rows)

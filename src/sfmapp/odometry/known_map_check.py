@@ -28,7 +28,7 @@ from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.refinement.calibration_check import LOSS_SIGMAS, adjust_poses
 from sfmapp.odometry.refinement.final_adjustment import MIN_SIGMA_PX
-from sfmapp.odometry.report import KnownMapReport
+from sfmapp.odometry.report import BeliefReport, KnownMapReport
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.odometry.tracker import MIN_INLIERS, measure_pose
 from sfmapp.scene.reconstruction import Reconstruction
@@ -201,7 +201,7 @@ class KnownMapCheck:
             entry.scale_source = self._known.scale_source
             entry.scale_sigma = widened_scale_sigma(self._known.scale_sigma, entry.contradictions)
 
-    def report(self, records: list[FrameRecord], keyframes: KeyframeMap | None, num_ambiguous: int) -> KnownMapReport:
+    def report(self, records: list[FrameRecord], keyframes: KeyframeMap | None, belief: BeliefReport) -> KnownMapReport:
         """What there is to say of it; keyframes: of the run in the known frame, None if no frame was found there."""
         posed = [record for record in records if record.has_pose]
         inside = [record for record in posed if record.map_idx == self.map_idx]
@@ -217,7 +217,7 @@ class KnownMapCheck:
         return KnownMapReport(
             source=self._known.source, num_keyframes=len(self.poses), num_places=self._num_places,
             is_found=bool(inside), num_localised=num_localised, num_new=len(inside) - num_localised,
-            num_elsewhere=len(posed) - len(inside), num_ambiguous=num_ambiguous, max_sigmas=MAX_SIGMAS,
+            num_elsewhere=len(posed) - len(inside), belief=belief, max_sigmas=MAX_SIGMAS,
             position_sigmas=None if against is None else against.position_sigmas,
             rotation_sigmas=None if against is None else against.rotation_sigmas,
             moved=None if against is None else against.moved, worst=None if against is None else against.worst,

@@ -9,12 +9,14 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.odometry.belief.belief import OwnFrame, PlaceBelief
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.loops.closing import apply_closure, join_maps
-from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder, LoopOptions
+from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder
 from sfmapp.odometry.loops.place_recognition import PlaceIndex
 from sfmapp.odometry.loops.place_recognition import View as PlaceView
-from sfmapp.odometry.loops.relocalize import Relocalization, RelocalizeOptions, is_ambiguous, relocalize
+from sfmapp.odometry.loops.relocalize import Relocalization, RelocalizeOptions, relocalize
+from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.records import FrameRecord
 
@@ -40,7 +42,7 @@ class Recognition:
     """All places of all maps.
 
     Attributes:
-        num_ambiguous: frames that might have been at several places of a known map.
+        belief: where the camera is in a known map; None without one.
 
     Args:
         executor: where vocabularies are learnt; None: in the thread that calls.
@@ -48,7 +50,8 @@ class Recognition:
 
     def __init__(self, seed: int, executor: Executor | None = None) -> None:
         self._places, self._finder = PlaceIndex(seed=seed, executor=executor), LoopFinder()
-        self._num_searches, self.num_ambiguous = 0, 0
+        self._num_searches, self._seed = 0, seed
+        self.belief: PlaceBelief | None = None
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0
         self._last = np.zeros(0, np.int64)
@@ -67,46 +70,42 @@ class Recognition:
                     local.map_idx, keyframe.frame_idx, picture, keyframe.xy[:, 0], keyframe.point_id
                 )  # fmt: skip
         self._places.learn()
+        self.belief = PlaceBelief(local.map_idx, local.keyframes, self._places, local.known.pictures, self._seed)
 
     def remember(
-        self, maps: dict[int, LocalMap], local: LocalMap, view: View, xy: Array, ids: Ids
-    ) -> LoopClosure | None:
+        self, maps: dict[int, LocalMap], local: LocalMap, view: View, xy: Array, ids: Ids, covariance: Array
+    ) -> LoopClosure | None:  # fmt: skip
         """Remember the newest keyframe of a map, if it shows something new, and say whether that closes a loop.
 
         Args:
             view: its frame. xy: (N, 2) pixels and ids: (N,) ascending, its triangulated points.
+            covariance: (6, 6) of its pose given the map; not finite where that was not measured.
         """
         is_new = len(ids) >= _MIN_POINTS and np.isin(ids, self._last, True).sum() <= _NEW_PLACE * len(ids)
+        is_open = self.belief is not None and self.belief.map_idx != local.map_idx and len(ids) >= _MIN_POINTS
         if is_new:
             self._last = ids
             seen = self._places.add(local.map_idx, view.frame_idx, view.images[0], xy, ids)
-        elif self._finder.is_suspicious:
+        elif is_open or self._finder.is_suspicious:
             seen = PlaceView(view.images[0], xy, ids)
         else:
             return None
-        if local.newest < self._resting_until:
+        if is_open:
+            self._look(maps, OwnFrame(local.map_idx, local.keyframes, local.newest, covariance), seen)
+        if local.newest < self._resting_until or not (is_new or self._finder.is_suspicious):
             return None
         keyframes = {number: other.keyframes for number, other in maps.items()}
-        closure = self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen)
-        if closure is not None and closure.old_map != closure.new_map and maps[closure.old_map].keyframes.num_known:
-            last = closure.views[-1]
-            frame_idx = maps[closure.old_map].keyframes.keyframes[last.old_idx].frame_idx
-            if self._is_elsewhere(maps, seen, Relocalization(closure.old_map, frame_idx, last.located)):
-                return None
-        return closure
+        barred = None if self.belief is None else self.belief.map_idx
+        return self._finder.find(keyframes, local.map_idx, self._places, view.frame_idx, seen, barred)
 
-    def _is_elsewhere(
-        self, maps: dict[int, LocalMap], seen: PlaceView, found: Relocalization, roll: float = 0.0
-    ) -> bool:
-        """Whether what was found in a known map might be another place of it, and so is not to be believed."""
-        if self.num_ambiguous:
-            # seen once at two places, the camera is between things that look alike: the next view, in which one of
-            # them falls just short, tells nothing (a street of equal houses: 20 m off, and sure)
-            return True
-        known = maps[found.map_idx].keyframes
-        is_open = is_ambiguous(known, self._places, seen, found, RelocalizeOptions(), roll)
-        self.num_ambiguous += is_open
-        return is_open
+    def _look(self, maps: dict[int, LocalMap], own: OwnFrame, seen: PlaceView) -> None:
+        """Judge where in the known map the camera is that makes a map of its own; where that is certain, the two are
+        held against each other as a loop is."""
+        belief = self.belief
+        assert belief is not None
+        belief.look(maps[belief.map_idx].keyframes, seen, own=own)
+        if belief.decided is not None and not self._finder.is_suspicious:
+            self._finder.suspect(belief.map_idx, belief.decided.known_from_own)
 
     def forget(self, frame_idx: int) -> bool:
         """Let go of a keyframe that is to be dropped; False if it is needed to confirm a loop."""
@@ -128,6 +127,8 @@ class Recognition:
             The map that holds the newest keyframe now, and the factor on its unit of length.
         """
         self._finder.reset()
+        if self.belief is not None:
+            self.belief.reset()
         local, scale = (
             self._close(maps, records, closure)
             if closure.old_map == closure.new_map
@@ -165,7 +166,7 @@ class Recognition:
         return kept, float(joined.kept_from_absorbed[7]) if newest is absorbed else 1.0
 
     def find(self, maps: dict[int, LocalMap], view: View) -> tuple[LocalMap, int, Array, Ids, Array] | None:
-        """Find a lost frame in any of the maps; in a known one as surely as a loop is, for nothing leads there.
+        """Find a lost frame in any of the maps; in a known one where :class:`PlaceBelief` is certain.
 
         Returns:
             The map, the frame that it looks like, the pose (7,), and the points seen: ids (N,) and pixels (N, 2).
@@ -178,12 +179,11 @@ class Recognition:
         keyframes = {number: local.keyframes for number, local in maps.items()}
         roll, self._num_searches = math.radians(_ROLLS_DEG[self._num_searches % 3]), self._num_searches + 1
         seen = PlaceView(view.images[0], corners)
-        found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll)
+        found = self._find_known(keyframes, seen, roll)
         if found is None:
-            return None
-        if keyframes[found.map_idx].num_known and (
-            found.located.agreement < LoopOptions().min_agreement or self._is_elsewhere(maps, seen, found, roll)
-        ):
+            barred = None if self.belief is None else self.belief.map_idx
+            found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll, barred)
+        if found is None:
             return None
         located = found.located
         return (
@@ -193,6 +193,17 @@ class Recognition:
             located.point_id,
             corners[located.corner_idx],
         )
+
+    def _find_known(self, keyframes: dict[int, KeyframeMap], seen: PlaceView, roll: float) -> Relocalization | None:
+        """Find a lost frame in the known map, if there is one and no other place of it might be the right one."""
+        belief = self.belief
+        if belief is None:
+            return None
+        belief.look(keyframes[belief.map_idx], seen, roll)
+        decided = belief.decided
+        if decided is None or decided.located is None:
+            return None
+        return Relocalization(belief.map_idx, decided.place, decided.located)
 
 
 def _renaming(num_points: int, renamed: Ids) -> NDArray[np.int32]:

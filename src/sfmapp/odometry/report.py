@@ -9,6 +9,28 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
 
 
+class BeliefReport(Report):
+    """Where a camera might have been in a known map, as far as images told.
+
+    Attributes:
+        num_looks: frames that were held against it. num_open: those after which several of its places fitted, and
+            none was believed. num_looks_to_decision: after which a place was believed first; absent if none was.
+        places: keyframes of the map near which the camera might be after the last of them, the likeliest first, and
+            probabilities: theirs. not_in_map: probability that it is in none of its places.
+        max_doubt: most that all else together may have where a place is believed.
+        max_particles: most that there were at a time.
+    """
+
+    num_looks: int
+    num_open: int
+    places: list[str]
+    probabilities: list[float]
+    not_in_map: float
+    max_doubt: float
+    max_particles: int
+    num_looks_to_decision: int | None = None
+
+
 class KnownMapReport(Report):
     """What a map that was there before has to do with a sequence.
 
@@ -18,7 +40,7 @@ class KnownMapReport(Report):
         is_found: frames were found in it.
         num_localised: frames whose pose was measured against its landmarks. num_new: frames with a pose in its frame,
             which see what was mapped anew. num_elsewhere: frames with a pose in a map of their own.
-        num_ambiguous: times that a frame might have been at several of its places, which was not believed.
+        belief: how it was found there, or why not.
         max_sigmas: beyond that, position_sigmas or rotation_sigmas are a contradiction.
         position_sigmas, rotation_sigmas: what the poses of keyframes by its landmarks alone, and by the sequence alone,
             differ by, rms, in standard deviations. Absent where fewer than three keyframes tell.
@@ -33,7 +55,7 @@ class KnownMapReport(Report):
     num_localised: int
     num_new: int
     num_elsewhere: int
-    num_ambiguous: int
+    belief: BeliefReport
     max_sigmas: float
     position_sigmas: float | None = None
     rotation_sigmas: float | None = None

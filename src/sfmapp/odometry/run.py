@@ -58,6 +58,7 @@ class _Tracked:
         tracks: of the last frame. is_mapped: (N,) which of them its pose was measured with.
         previous: pyramid of the last frame; None before the first.
         num_mapped_at_keyframe: how many were mapped when the newest keyframe was made.
+        covariance: (6, 6) of the pose given the map; not finite where it was not measured.
     """
 
     pose: Array = field(default_factory=rigid3.IDENTITY.copy)
@@ -65,6 +66,7 @@ class _Tracked:
     is_mapped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     previous: Pyramid | None = None
     num_mapped_at_keyframe: int = 0
+    covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
 
     def drop_tracks(self) -> None:
         """Nothing is followed any more."""
@@ -262,6 +264,7 @@ class Odometry:
             return False
         self.motion.learn(rigid3.compose(found.pose, rigid3.inverse(tracked.pose)))
         tracked.pose, tracked.tracks, tracked.is_mapped = found.pose, found.tracks, found.is_mapped
+        tracked.covariance = found.covariance
         local.witnesses.followed(view.frame_idx, found.num_followed, len(found.tracks))
         reason = keyframe_reason(local, found, tracked.num_mapped_at_keyframe, self.options)
         if reason is None:
@@ -415,7 +418,7 @@ class Odometry:
         if not self.options.loops:
             return
         mapped, maps = self.tracked.tracks.subset(self.tracked.is_mapped), self.atlas.maps
-        closure = self.recognition.remember(maps, local, view, mapped.xy, mapped.point_id)
+        closure = self.recognition.remember(maps, local, view, mapped.xy, mapped.point_id, self.tracked.covariance)
         if closure is None:
             return
         self.calibration.forget()
@@ -521,7 +524,8 @@ class Odometry:
         known_map = None
         if self.known is not None:
             inside = maps.get(self.known.map_idx)
-            known_map = self.known.report(self.records, inside, self.recognition.num_ambiguous)
+            assert self.recognition.belief is not None
+            known_map = self.known.report(self.records, inside, self.recognition.belief.report())
         return OdometryReport(
             num_frames=len(self.records), num_tracked=int(tracked.sum()), num_maps=len(result.maps),
             num_keyframes=[len(m.keyframe_frame_idx) for m in result.maps],

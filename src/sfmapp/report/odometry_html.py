@@ -10,7 +10,7 @@ import numpy as np
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import GroundTruth
-from sfmapp.odometry.report import KnownMapReport
+from sfmapp.odometry.report import BeliefReport, KnownMapReport
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.report.model import (
     Gap,
@@ -32,6 +32,8 @@ from sfmapp.report.plots import Curve, plot_svg
 MAX_VIEWS = 4
 MAX_GAPS = 50
 _ORANGE, _GREY = "#e07b00", "#999"
+# Places of a known map that are named.
+_MAX_PLACES = 4
 
 
 def render_odometry_html(
@@ -223,8 +225,7 @@ def _ground_truth(rows: Sequence[GroundTruthReport]) -> str:
 def known_map_text(row: KnownMapReport) -> str:
     """What a known map has to do with the sequence, in one sentence."""
     if not row.is_found:
-        open_places = f"; {row.num_ambiguous} times it might have been at several places" if row.num_ambiguous else ""
-        return f"no frame was found in {row.source}{open_places}"
+        return f"no frame was found in {row.source}"
     text = f"{row.num_localised} frames localised in {row.source}, {row.num_new} mapped anew beside it"
     if row.num_elsewhere:
         text += f", {row.num_elsewhere} in a map of their own"
@@ -238,7 +239,24 @@ def known_map_text(row: KnownMapReport) -> str:
 
 def _known_map(row: KnownMapReport) -> str:
     places = f"It has {row.num_keyframes} keyframes or photographs, {row.num_places} with a picture to know it by."
-    return f"<h2>Known map</h2><p>{escape(known_map_text(row))}.</p><p class=dim>{escape(places)}</p>"
+    told = f"<p>{escape(belief_text(row.belief))}</p>" if row.belief.num_looks else ""
+    return f"<h2>Known map</h2><p>{escape(known_map_text(row))}.</p>{told}<p class=dim>{escape(places)}</p>"
+
+
+def belief_text(row: BeliefReport) -> str:
+    """How a camera was found in a known map, or where it might be, in sentences."""
+    looked = f"{row.num_looks} frames were held against its places, with up to {row.max_particles} particles"
+    if row.num_looks_to_decision is not None:
+        after = f"a place was believed after {row.num_looks_to_decision}"
+        several = f"; {row.num_open} times several places fitted, and none was believed" if row.num_open else ""
+        return f"{looked}: {after} (all else together below {row.max_doubt:g}){several}."
+    if not row.places:
+        return f"{looked}: none of them fits."
+    named = [f"{name} ({probability:.2g})" for name, probability in zip(row.places, row.probabilities, strict=True)]
+    shown = ", ".join(named[:_MAX_PLACES]) + (
+        f" and {len(named) - _MAX_PLACES} more" if len(named) > _MAX_PLACES else ""
+    )
+    return f"{looked}: undecided. It may be near {shown}, or in none of its places ({row.not_in_map:.2g})."
 
 
 def _loops(decisions: Iterable[LogLine]) -> str:

@@ -49,6 +49,7 @@ ODOMETRY_MODULES = (
     "sfmapp.adjust.calibration",
     "sfmapp.odometry.loops.relocalize",
     "sfmapp.odometry.loops.pose_graph",
+    "sfmapp.odometry.belief.particles",
 )
 DENSE_MODULES = ("sfmapp.dense.densify",)
 INERTIAL_MODULES = ("sfmapp.odometry.inertial.gyroscope", "sfmapp.odometry.inertial.integration")

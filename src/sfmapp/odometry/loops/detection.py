@@ -125,15 +125,21 @@ class LoopFinder:
         """Forget what is suspected: the map has changed under it, or another has begun."""
         self._suspicion = None
 
+    def suspect(self, old_map: int, old_from_new: Array) -> None:
+        """Have the keyframes that follow looked for where a similarity (8,) puts them in another map."""
+        self._suspicion = _Suspicion(old_map, old_from_new)
+
     def find(
-        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, frame_idx: int, view: View
-    ) -> LoopClosure | None:
+        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, frame_idx: int, view: View,
+        barred: int | None = None,
+    ) -> LoopClosure | None:  # fmt: skip
         """Look whether a new keyframe closes a loop of its map, or shows a place of another map.
 
         Args:
             maps: by their numbers.
             map_idx, frame_idx: the keyframe, which ``places`` knows; while a loop is suspected any keyframe.
             view: as ``places.add`` returned it, or its image, points and their ids.
+            barred: a map that is looked into only where :meth:`suspect` has said so.
 
         Returns:
             A loop once it is certain. The maps are only read.
@@ -146,7 +152,7 @@ class LoopFinder:
         candidates += places.query(frame_idx, other_maps=True)
         for candidate in candidates:
             old_map = maps.get(candidate.map_idx)
-            if old_map is None:
+            if old_map is None or candidate.map_idx == barred:
                 continue
             old_idx = position_of(old_map, candidate.frame_idx)
             roll = 0.0
@@ -156,8 +162,8 @@ class LoopFinder:
             located = locate(old_map, places, view, candidate, self.options.relocalize, roll)
             if located is None or not is_convincing(located, view, self.options.relocalize):
                 continue
-            seen = self._view(old_map, places, view, new_idx, old_idx, located)
-            start = _initial_similarity(keyframes, seen, self.options)
+            seen = seen_in(old_map, places, view, (new_idx, old_idx), located, self.options.relocalize)
+            start = initial_similarity(keyframes, seen, self.options)
             if start is None:
                 continue
             suspicion = _Suspicion(candidate.map_idx, start, [seen])
@@ -177,7 +183,7 @@ class LoopFinder:
         if old_map is not None:
             pose = similarity.transform_poses(suspicion.old_from_new, keyframes.keyframes[new_idx].rig_from_world)
             last_old = max(0, suspicion.views[0].new_idx - self.options.min_gap) if old_map is keyframes else None
-            old_idx = _nearest_place(old_map, places, pose, last_old)
+            old_idx = nearest_place(old_map, places, pose, last_old)
             if old_idx is not None:
                 seen = self._seen_near(old_map, places, view, new_idx, old_idx, pose)
         if seen is not None:
@@ -204,15 +210,7 @@ class LoopFinder:
         located = locate_near(local, view, camera, pose, options)
         if located is None or not is_convincing(located, view, options):
             return None
-        return self._view(old_map, places, view, new_idx, old_idx, located)
-
-    def _view(
-        self, old_map: KeyframeMap, places: PlaceIndex, view: View, new_idx: int, old_idx: int, located: Located
-    ) -> LoopView:
-        frame_idx = old_map.keyframes[old_idx].frame_idx
-        local = local_points(old_map, places, frame_idx, self.options.relocalize.num_neighbors)
-        old = local.subset(np.searchsorted(local.point_id, located.point_id))
-        return LoopView(new_idx, old_idx, old, view.point_id[located.corner_idx], view.xy[located.corner_idx], located)
+        return seen_in(old_map, places, view, (new_idx, old_idx), located, options)
 
     def _neighbors(self, keyframes: KeyframeMap, new_idx: int) -> list[int]:
         """Frames that are no loop with a keyframe: those just before it and those that see the same points."""
@@ -255,7 +253,7 @@ class LoopFinder:
         )  # fmt: skip
 
 
-def _nearest_place(keyframes: KeyframeMap, places: PlaceIndex, pose: Array, last: int | None) -> int | None:
+def nearest_place(keyframes: KeyframeMap, places: PlaceIndex, pose: Array, last: int | None) -> int | None:
     """The keyframe before a last one that is a place and looks from nearest in nearly the same direction: distance over
     its depth, plus radians between the axes."""
     known = np.array([n for n, k in enumerate(keyframes.keyframes[:last]) if k.frame_idx in places], np.int64)
@@ -267,7 +265,17 @@ def _nearest_place(keyframes: KeyframeMap, places: PlaceIndex, pose: Array, last
     return int(known[np.argmin(distance + np.arccos(np.clip(axis, -1.0, 1.0)))])
 
 
-def _initial_similarity(keyframes: KeyframeMap, view: LoopView, options: LoopOptions) -> Array | None:
+def seen_in(
+    old_map: KeyframeMap, places: PlaceIndex, view: View, pair: tuple[int, int], located: Located,
+    options: RelocalizeOptions,
+) -> LoopView:  # fmt: skip
+    """A located keyframe as one view of a loop; pair: positions of the new and of the old keyframe."""
+    local = local_points(old_map, places, old_map.keyframes[pair[1]].frame_idx, options.num_neighbors)
+    old = local.subset(np.searchsorted(local.point_id, located.point_id))
+    return LoopView(*pair, old, view.point_id[located.corner_idx], view.xy[located.corner_idx], located)
+
+
+def initial_similarity(keyframes: KeyframeMap, view: LoopView, options: LoopOptions) -> Array | None:
     """From the pose of the new keyframe in the old world; the scale is the ratio of its points' depths on both sides.
 
     None where too few points have a depth on both sides or, in stereo, where these contradict.

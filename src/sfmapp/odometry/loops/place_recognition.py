@@ -217,13 +217,15 @@ class PlaceIndex:
         reference = self._reference[row]
         return self._best(self._vectors[row], allowed, reference if np.isfinite(reference) else self._usual(), False)
 
-    def query_view(self, view: View, roll: float = 0.0) -> list[Candidate]:
-        """Places of any map that look like an image; without a vocabulary yet, the last places."""
+    def query_view(self, view: View, roll: float = 0.0, map_idx: int | None = None) -> list[Candidate]:
+        """Places that look like an image, of one map or of any; without a vocabulary yet, the last places."""
+        allowed = np.array([map_idx is None or place.map_idx == map_idx for place in self._places], bool)
         if self._words is None:
-            latest = self._places[: -1 - self.options.num_candidates * _ISLAND : -_ISLAND]
+            last = np.flatnonzero(allowed)[: -1 - self.options.num_candidates * _ISLAND : -_ISLAND]
+            latest = [self._places[k] for k in last]
             return [Candidate(place.map_idx, place.frame_idx, math.nan) for place in latest]
         vector = _vector(view.descriptors(roll=roll), self._words)
-        return self._best(vector, np.ones(len(self._places), bool), self._usual(), True)
+        return self._best(vector, allowed, self._usual(), True)
 
     def rename_points(self, map_idx: int, old_id: Ids, new_id: Ids) -> None:
         """Points of a map that turned out to be others. Of two that become the same in one place the first stays."""

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.pose import refine_pose
+from sfmapp.adjust.pose import RefinedPose, refine_pose
 from sfmapp.camera.camera import Camera, pixels_to_normalized, project
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.resection import estimate_pose
@@ -115,49 +115,31 @@ class Relocalization:
 
 
 def relocalize(
-    maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0
-) -> Relocalization | None:
+    maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0,
+    barred: int | None = None,
+) -> Relocalization | None:  # fmt: skip
     """Find an image in any of the maps.
 
     Args:
         maps: by the number that they have in ``places``.
         roll: radians by which the image is thought to be turned against the keyframes, from x to y. Descriptors bear
             15 degrees of error, so try 0 and, on other frames, plus and minus 25 degrees.
+        barred: number of a map that is not looked into.
     """
     for candidate in places.query_view(view, roll):
+        if candidate.map_idx == barred:
+            continue
         found = locate(maps[candidate.map_idx], places, view, candidate, options, roll)
         if found is not None and is_convincing(found, view, options):
             return Relocalization(candidate.map_idx, candidate.frame_idx, found)
     return None
 
 
-def is_ambiguous(
-    keyframes: KeyframeMap,
-    places: PlaceIndex,
-    view: View,
-    found: Relocalization,
-    options: RelocalizeOptions,
-    roll: float = 0.0,
-) -> bool:
-    """Whether an image that was found in a map could as well be elsewhere in it: in a street of equal houses, a hall of
-    equal pillars.
-
-    Args:
-        keyframes, places: the map that it was found in. found: where. Others as of :func:`relocalize`.
-    """
-    pose = found.located.cam_from_world
-    depth = float(np.median(rigid3.apply(pose, keyframes.point_xyz[found.located.point_id])[:, 2]))
-    for candidate in places.query_view(view, roll):
-        if candidate.map_idx != found.map_idx or candidate.frame_idx == found.frame_idx:
-            continue
-        other = locate(keyframes, places, view, candidate, options, roll)
-        if other is None or not is_convincing(other, view, options):
-            continue
-        change = rigid3.compose(other.cam_from_world, rigid3.inverse(pose))
-        turn = rigid3.rotation_angle_deg(rigid3.rotation_matrix(change))
-        if np.linalg.norm(change[4:]) > _ELSEWHERE_DEPTHS * depth or turn > _ELSEWHERE_DEG:
-            return True
-    return False
+def is_elsewhere(pose: Array, other: Array, depth: float) -> bool:
+    """Whether two poses (7,) of one image are two places; depth: of what it sees."""
+    change = rigid3.compose(other, rigid3.inverse(pose))
+    turn = float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(change)))
+    return bool(np.linalg.norm(change[4:]) > _ELSEWHERE_DEPTHS * depth or turn > _ELSEWHERE_DEG)
 
 
 def locate(
@@ -195,6 +177,20 @@ def locate_near(
     Args:
         predicted: (7,) cam_from_world, good to about four inlier thresholds.
     """
+    held = hold_near(local, view, camera, predicted, options)
+    if held is None:
+        return None
+    refined, point, corner = held
+    num_in_view, agreement = agreement_at(local, view, camera, refined.cam_from_world)
+    return Located(
+        refined.cam_from_world, refined.covariance, local.point_id[point], corner, num_matches, num_in_view, agreement
+    )
+
+
+def hold_near(
+    local: LocalPoints, view: View, camera: Camera, predicted: Array, options: RelocalizeOptions
+) -> tuple[RefinedPose, Ids, Ids] | None:
+    """The pose of :func:`locate_near`, positions of the points that hold it, and their corners: both (M,)."""
     limit = options.error_px(camera)
     pose = predicted
     for radius in (4.0 * limit, 2.0 * limit):
@@ -209,10 +205,7 @@ def locate_near(
     good = refined.is_inlier
     if not np.isfinite(pose).all() or good.sum() < 6:
         return None
-    num_in_view, agreement = agreement_at(local, view, camera, pose)
-    return Located(
-        pose, refined.covariance, local.point_id[point[good]], corner[good], num_matches, num_in_view, agreement
-    )
+    return refined, point[good], corner[good]
 
 
 def is_convincing(found: Located, view: View, options: RelocalizeOptions) -> bool:
@@ -321,7 +314,13 @@ def match_projected(
 
 
 def agreement_at(local: LocalPoints, view: View, camera: Camera, pose: Array) -> tuple[int, float]:
-    """How many points a pose puts into the image, and the share of these that the image looks like in their places.
+    """How many points a pose puts into the image, and the share of these that :func:`agreeing_at` says to agree."""
+    point_id, agrees = agreeing_at(local, view, camera, pose)
+    return len(point_id), float(agrees.mean()) if len(point_id) > 1 else 0.0
+
+
+def agreeing_at(local: LocalPoints, view: View, camera: Camera, pose: Array) -> tuple[Ids, Mask]:
+    """The points (N,) that a pose puts into the image, and which of them the image looks like in their places.
 
     A point agrees if nineteen in twenty of the others resemble what is there less than it does itself. No threshold on
     the likeness is involved, so light and blur do not matter much; under a wrong pose one point in twenty agrees.
@@ -331,9 +330,9 @@ def agreement_at(local: LocalPoints, view: View, camera: Camera, pose: Array) ->
     margin = 2.0 * SIGMA_PX * 3.0
     size = np.array(view.shape[::-1])
     seen = np.asarray(((expected > margin) & (expected < size - margin)).all(1))  # False for NaN
-    if seen.sum() < 2:
-        return int(seen.sum()), 0.0
     shown = local.subset(seen)
+    if seen.sum() < 2:
+        return shown.point_id, np.zeros(int(seen.sum()), bool)
     place, ratio = expected[seen], shown.depth / in_camera[seen, 2]
     angle = twist(rigid3.rotation_matrix(pose), shown.rotation)
     found = view.describe(place, SIGMA_PX * ratio, angle)
@@ -341,7 +340,7 @@ def agreement_at(local: LocalPoints, view: View, camera: Camera, pose: Array) ->
     own = np.diag(products)
     apart = np.linalg.norm(place[:, None] - place[None], axis=2) > _SAME_PATCH_SIGMAS * SIGMA_PX
     rank = ((products >= own[:, None]) & apart).sum(1) / np.maximum(apart.sum(1), 1)
-    return int(seen.sum()), float((rank < _CHANCE_RANK).mean())
+    return shown.point_id, rank < _CHANCE_RANK
 
 
 def twist(rotation: Array, other: Array) -> Array:
