@@ -170,14 +170,21 @@ def _hold_on_ray(
     bit = np.uint8(0) if is_held else np.uint8(1 << fan)
     if not is_held:
         first[j] = shaded.shape[0]
-    for k in range(shaded.shape[0]):
-        # base = across (cot at camera + cot at light)
+    dx, dy, dz = cotangent * ax + px, cotangent * ay + py, cotangent * az + pz
+    near, far = _within(ox, dx, nx, 0.0, math.inf)
+    near, far = _within(oy, dy, ny, near, far)
+    near, far = _within(oz, dz, nz, near, far)
+    if near >= far:
+        return
+    # base = across (cot at camera + cot at light)
+    begin = (math.atan2(near, planes.base - near * cotangent) - planes.low[2]) / planes.step[2]
+    end = (math.atan2(far, planes.base - far * cotangent) - planes.low[2]) / planes.step[2]
+    for k in range(max(math.floor(begin), 0), min(math.ceil(end) + 1, shaded.shape[0])):
         total = cotangent + cotangents[k]
         if total <= 0.0:
             break
         across = planes.base / total
-        along = across * cotangent
-        x, y, z = ox + along * ax + across * px, oy + along * ay + across * py, oz + along * az + across * pz
+        x, y, z = ox + across * dx, oy + across * dy, oz + across * dz
         if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz) or filled[int(x), int(y), int(z)] == 0:
             continue
         if not is_held and shaded[k] & bit:
@@ -185,6 +192,15 @@ def _hold_on_ray(
             first[j] = k
         if is_held:
             shaded[k] = 255
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _within(start: float, slope: float, size: float, near: float, far: float) -> tuple[float, float]:
+    """The part of a range in which ``start + t slope`` lies between 0 and a size; empty where near is not below far."""
+    if slope == 0.0:
+        return (near, far) if 0.0 <= start < size else (far, near)
+    a, b = -start / slope, (size - start) / slope
+    return max(near, min(a, b)), min(far, max(a, b))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -61,7 +61,8 @@ def _body(
     yield from _photographs(report, views, silhouettes, shape, read)
     yield from _fits(report)
     if report.limits is not None:
-        yield _limits(report.limits, None if report.joining is None else _teller(report))
+        outlines = "outlines alone" if report.shadows is None else "outlines and shadows alone"
+        yield _limits(report.limits, None if report.joining is None else _teller(report), outlines)
     yield from _slices(shape.octree, shape.mesh)
     yield _levels(report)
     yield log_table("Decisions", report.decisions)
@@ -198,8 +199,8 @@ def _fits(report: CarveReport) -> Iterator[str]:
         yield f"<p class=dim>{escape(entry.name)}: {escape(entry.reason)}</p>"
 
 
-def _limits(limits: LimitsReport, teller: str | None) -> str:
-    """``teller``: what was joined with the silhouettes, if anything."""
+def _limits(limits: LimitsReport, teller: str | None, outlines: str) -> str:
+    """``teller``: what was joined with the silhouettes, if anything; ``outlines``: these, and what carved besides."""
     text = "<h2>What is not known</h2><p>"
     if teller is not None:
         text += (
@@ -207,7 +208,7 @@ def _limits(limits: LimitsReport, teller: str | None) -> str:
             f"by neither {teller} nor outlines: it closes the rest, and the object's own surface may be elsewhere. "
         )
     text += (
-        f"{limits.outlines_share:.1%} of the surface is told by outlines alone: photographs see it, and it may be "
+        f"{limits.outlines_share:.1%} of the surface is told by {outlines}: photographs see it, and it may be "
         f"hollow there. {limits.unseen_share:.1%} no photograph sees. The object's volume is no more than "
         f"{limits.volume_high:.5g}"
     )
