@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from machine import RESULTS, describe_machine
-from rendered_worlds.lit_solids import NEAR_LAMPS_DEG, Rig, around, drawn, house, jug, lamps_at
+from rendered_worlds.lit_solids import NEAR_LAMPS_DEG, WIDE_LAMPS_DEG, Rig, around, drawn, house, jug, lamps_at
 from rendered_worlds.shadow_bound import shares_shown
 from rendered_worlds.solids import Rendering, Solid, photograph, render
 from sfmapp.carve.cell_grid import CellGrid, grid_of
@@ -43,26 +43,61 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 
 DENSITIES = {"24x4": (24, 4), "72x8": (72, 8), "16x4": (16, 4)}
-# scene, density, seed of the noise, finest cells along the side of the cube, width of the photographs
+LAMPS_DEG = {19: NEAR_LAMPS_DEG, 30: WIDE_LAMPS_DEG}
+
+
+class Case(NamedTuple):
+    """What is measured: lamps and edges in degrees, edges None if nothing is told of them, finest cells along the side
+    of the cube, width of the photographs, seed of the noise."""
+
+    scene: str
+    density: str
+    cells: int = 128
+    width: int = 400
+    seed: int = 0
+    lamps: int = 19
+    edges: int | None = None
+
+
 ROWS = (
-    ("house", "16x4", 0, 128, 400), ("drawn 2", "16x4", 0, 128, 400), ("jug", "16x4", 0, 128, 400),
-    ("drawn 1", "16x4", 0, 128, 400), ("house", "24x4", 0, 128, 400), ("house", "72x8", 0, 64, 200),
-    ("house", "72x8", 0, 128, 400), ("house", "16x4", 0, 256, 800), ("jug", "24x4", 0, 128, 400),
-    ("drawn 2", "72x8", 0, 128, 400), ("house", "16x4", 1, 128, 400),
+    *(Case(scene, density) for density in DENSITIES for scene in ("house", "jug", "drawn 2")),
+    Case("drawn 1", "16x4"), *(Case(f"drawn {n}", "16x4") for n in (3, 4, 5)),
+    *(Case("house", "16x4", seed=seed) for seed in (1, 2)),
+    Case("house", "16x4", 256, 800), Case("house", "24x4", 256, 800), Case("drawn 2", "16x4", 256, 800),
+    *(Case(scene, "16x4", lamps=30, edges=edges) for scene in ("house", "jug", "drawn 2") for edges in (None, 60)),
 )  # fmt: skip
 NOISE_GREY = 2.0
 POINTS = 100_000
 # places of the hull that are asked for what shadows could show of them
-PLACES = 6000
+PLACES = 3000
 TITLE = """# Shadow carving
 
-Rendered solids of exact shape, photographs with two grey levels of noise, lamps 19 degrees from the camera (of eight,
-the last four 39), nothing told of edges. Errors are those of the volume, in the middle between its cells without and
-with those at the surface, against the true one; *below*: how much less than the hull's, 30 % wanted. *At best*: what no
-method could pass, with exact masks and cells without size: of the hull's air the share that some camera sees with a
-shadow behind, and that the light of this shadow reaches; *thrown*: the same by shadows that something throws, leaving
-out those of surfaces that are turned away. `python benchmarks/shadow_carving.py`
+Rendered solids of exact shape, photographs with two grey levels of noise. The rendered scene is the house (an arch, a
+cavity, a bowl, a niche); the others are there to see that nothing was made for it. Densities are those of the text,
+which says nothing of where its lamps stood: 19 degrees from the camera (of eight, the last four 39), where nothing has
+to be told of edges, or 30. Errors are those of the volume, in the middle between its cells without and with those at
+the surface, against the true one; *below*: how much less than the hull's, 30 % wanted. *At best*: what no method could
+pass, with exact masks and cells without size: of the hull's air the share that some camera sees with a shadow behind,
+and that the light of this shadow reaches; *thrown*: the same by shadows that something throws, leaving out those of
+surfaces that are turned away. `python benchmarks/shadow_carving.py`
 
+"""
+
+NOTES = """
+Where the rest is lost (house, 16x4, 128 cells, 400 pixels, lamps at 19 degrees; 31.3 % below the hull's):
+
+| with | below |
+|---|---|
+| exact shadows in place of those found in photographs with noise | 32.1 % |
+| and up to the edges of pixels, without the quarter of a pixel that a lit corner may reach into a dark one | 34.2 % |
+| exact shadows, a fan of 2 degrees for all in place of 0.5 where it is dark enough | 26.8 % |
+| found shadows, half planes sampled every 0.35 cells in place of 0.5, at twice the time | 32.4 % |
+| found shadows, mixtures of three lamps as well | 31.4 % |
+| before: a fan of 2 degrees, means of 3 x 3 pixels, distances to lit pixels by circles | 16.3 % |
+
+What is missing to the best is cells that are dark and free in part (28.7 % became 34.1 when the cells of an earlier
+state of the code were halved, with the same photographs and exact shadows), and that a lit pixel holds all of its ray:
+one photograph does not say how deep the surface is that it shows. A second passage of all photographs takes 0.3 % more.
 """
 
 
@@ -76,10 +111,10 @@ class Scene:
     pictures: list[Rendering]
 
 
-def scene_of(name: str, density: str, width: int) -> Scene:
+def scene_of(name: str, density: str, width: int, lamps_deg: int = 19) -> Scene:
     """Render a solid from all positions under all lamps."""
     solid = house() if name == "house" else jug() if name == "jug" else drawn(int(name.split()[1]))
-    rig = around(*DENSITIES[density], width=width, lamps_deg=NEAR_LAMPS_DEG)
+    rig = around(*DENSITIES[density], width=width, lamps_deg=LAMPS_DEG[lamps_deg])
 
     def one(i: int) -> Rendering:
         places = np.vstack([rigid3.center(rig.poses[i]), rig.lamps[i]])
@@ -103,9 +138,11 @@ def hull_of_scene(scene: Scene, cells: int) -> Octree:
     return carve(scene.views, silhouettes, [-half] * 3, 2.0 * half, CarveOptions(cells))[0]
 
 
-def shadows_of(scene: Scene, hull: Octree, seed: int) -> tuple[list[Shadow], list[LampLight], list[dict[str, Any]]]:
+def shadows_of(
+    scene: Scene, hull: Octree, seed: int, options: ShadowOptions
+) -> tuple[list[Shadow], list[LampLight], list[dict[str, Any]]]:
     """Found in photographs with noise."""
-    photographs, options = [], ShadowOptions()
+    photographs = []
     for i, (picture, lamps) in enumerate(zip(scene.pictures, scene.rig.lamps, strict=True)):
         lit, *under = (photograph(light, NOISE_GREY, [seed, i, k]) for k, light in enumerate(picture.light))
         photographs.append(LitPhotograph(lit, under, picture.cover == 1.0, scene.views[i], lamps, hull))
@@ -144,11 +181,11 @@ def best_percent(scene: Scene, hull: Octree) -> tuple[float, float]:
     return 100.0 * shown, 100.0 * thrown
 
 
-def measure(scene: Scene, hull: Octree, seed: int) -> tuple[dict[str, Any], Octree]:
+def measure(scene: Scene, hull: Octree, seed: int, options: ShadowOptions) -> tuple[dict[str, Any], Octree]:
     """Volume of hull and carved volume, each in the middle of its bounds, against the true one; points taken away."""
-    shadows, mixed, lights = shadows_of(scene, hull, seed)
+    shadows, mixed, lights = shadows_of(scene, hull, seed, options)
     start = time.process_time()
-    carved, report = carve_shadows(hull, scene.views, shadows, lights=mixed)
+    carved, report = carve_shadows(hull, scene.views, shadows, options, lights=mixed)
     cpu_s = time.process_time() - start
     true = scene.solid.volume()
     hull_error, error = (float(np.mean(tree.volume_bounds())) - true for tree in (hull, carved))
@@ -170,29 +207,29 @@ def measure(scene: Scene, hull: Octree, seed: int) -> tuple[dict[str, Any], Octr
 
 
 def rows(only: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Each scene is rendered once for all seeds."""
-    wanted = [row for row in ROWS if all(word in row for word in only)]
-    for name, density, cells, width in dict.fromkeys(row[:2] + row[3:] for row in wanted):
-        scene = scene_of(name, density, width)
-        hull = hull_of_scene(scene, cells)
+    """Each scene is rendered once for all seeds and edges."""
+    wanted = [case for case in ROWS if all(word in case for word in only)]
+    alike = dict.fromkeys(case._replace(seed=0, edges=None) for case in wanted)
+    for first in alike:
+        scene = scene_of(first.scene, first.density, first.width, first.lamps)
+        hull = hull_of_scene(scene, first.cells)
         best, thrown = best_percent(scene, hull)
-        for seed in (row[2] for row in wanted if row[:2] + row[3:] == (name, density, cells, width)):
-            row, _ = measure(scene, hull, seed)
-            yield {"scene": name, "density": density, "cells": cells, "width": width, "seed": seed,
-                   "best_percent": best, "best_thrown_percent": thrown, **row}  # fmt: skip
+        for case in (case for case in wanted if case._replace(seed=0, edges=None) == first):
+            options = ShadowOptions() if case.edges is None else ShadowOptions(edge_deg=case.edges)
+            row, _ = measure(scene, hull, case.seed, options)
+            yield {**case._asdict(), "best_percent": best, "best_thrown_percent": thrown, **row}
 
 
 def table(measured: Sequence[dict[str, Any]]) -> str:
     """Markdown."""
-    head = "| scene | positions x lights | cells | pixels | seed | hull | with shadows | below | "
+    head = "| scene | positions x lights | lamps | edges told | cells | pixels | seed | hull | with shadows | below | "
     head += "at best | thrown | true points lost | CPU s |"
-    lines = [head, "|---|---|---|---|---|---|---|---|---|---|---|---|"]
+    lines = [head, "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"]
     for row in measured:
         lines.append(
-            f"| {row['scene']} | {row['density']} | {row['cells']} | {row['width']} | {row['seed']} | "
-            f"{row['hull_error_percent']:.1f} % | {row['error_percent']:.1f} % | "
-            f"{row['below_hull_percent']:.1f} % | {row['best_percent']:.0f} % | "
-            f"{row['best_thrown_percent']:.0f} % | "
+            f"| {row['scene']} | {row['density']} | {row['lamps']} deg | {row['edges'] or 'no'} | {row['cells']} | "
+            f"{row['width']} | {row['seed']} | {row['hull_error_percent']:.1f} % | {row['error_percent']:.1f} % | "
+            f"{row['below_hull_percent']:.1f} % | {row['best_percent']:.0f} % | {row['best_thrown_percent']:.0f} % | "
             f"{row['points_lost']} of {row['points']:,} | {row['cpu_s']:.0f} |"
         )
     return "\n".join(lines)
@@ -225,7 +262,7 @@ def picture(path: Path) -> None:
     """House from one side: lit from the camera, under a lamp, its shadows; hull, carved volume, and a slice of both."""
     scene = scene_of("house", "24x4", 400)
     hull = hull_of_scene(scene, 128)
-    shadows, mixed, _ = shadows_of(scene, hull, 0)
+    shadows, mixed, _ = shadows_of(scene, hull, 0, ShadowOptions())
     carved, _ = carve_shadows(hull, scene.views, shadows, lights=mixed)
     at = max(range(len(scene.views)), key=lambda i: scene.views[i].center @ [0.9, 0.1, 0.4])
     view, first, before, after = scene.views[at], scene.pictures[at], grid_of(hull), grid_of(carved)
@@ -263,7 +300,7 @@ def main() -> None:
         if args.only:
             continue
         path.write_text(json.dumps({**describe_machine(), "rows": measured}, indent=1) + "\n", encoding="utf-8")
-        path.with_suffix(".md").write_text(TITLE + table(measured) + "\n", encoding="utf-8")
+        path.with_suffix(".md").write_text(TITLE + table(measured) + "\n" + NOTES, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,8 @@ LAMPS_DEG = ((-55, 0), (55, 0), (0, 32), (0, -32), (-20, 20), (20, 20), (35, -35
 # the same near the camera, where single shadows tell of all edges that are no sharper than 20 degrees; the last four
 # are farther, and of use by their mixtures
 NEAR_LAMPS_DEG = ((-19, 0), (19, 0), (0, 19), (0, -19), (-28, 28), (28, 28), (28, -28), (-28, -28))
+# in between, where what shadows tell is not bound by their width: of use if the object's edges are told
+WIDE_LAMPS_DEG = ((-30, 0), (30, 0), (0, 30), (0, -30))
 X, Y = (0.0, np.pi / 2, 0.0), (np.pi / 2, 0.0, 0.0)
 
 

@@ -69,7 +69,8 @@ class ShadowOptions:
         max_angle_deg: Light and camera farther apart, as seen from the object, are not used together, degrees.
         edge_deg: No edge of the object is sharper, interior angle in degrees. Between light and camera farther apart,
             only what is shown to lean towards the light counts as shadow.
-        margin_px: Beside a lit pixel, how wide a lit strip of a dark one may be that is not noticed, pixels.
+        margin_px: What is no farther than that from a lit pixel does not count as dark, pixels: the lit part of a dark
+            pixel may be too small to be noticed, and cameras may be off.
     """
 
     fan_deg: float = 2.0
