@@ -34,6 +34,9 @@ _CORNERS, _CORNER_DISTANCE_PX = 1000, 5.0
 # Rolls at which a lost frame is looked at, one after the other: descriptors bear 15 degrees.
 _ROLLS_DEG = (0.0, 25.0, -25.0)
 
+# Keyframes after which one is held against a known map in any case.
+_LOOK_AGAIN = 3
+
 # Keyframes after a loop before the next is looked for: what drifts in between is what a window can bear.
 _REST = 30
 
@@ -54,6 +57,8 @@ class Recognition:
         self.belief: PlaceBelief | None = None
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0
+        # keyframe of the current map that was held against a known one last
+        self._looked_at = 0
         self._last = np.zeros(0, np.int64)
 
     @property
@@ -83,6 +88,9 @@ class Recognition:
         """
         is_new = len(ids) >= _MIN_POINTS and np.isin(ids, self._last, True).sum() <= _NEW_PLACE * len(ids)
         is_open = self.belief is not None and self.belief.map_idx != local.map_idx and len(ids) >= _MIN_POINTS
+        # keyframes in between show what the ones before have shown
+        is_again = not 0 <= local.newest - self._looked_at < _LOOK_AGAIN
+        is_open &= is_new or self._finder.is_suspicious or is_again
         if is_new:
             self._last = ids
             seen = self._places.add(local.map_idx, view.frame_idx, view.images[0], xy, ids)
@@ -91,6 +99,7 @@ class Recognition:
         else:
             return None
         if is_open:
+            self._looked_at = local.newest
             self._look(maps, OwnFrame(local.map_idx, local.keyframes, local.newest, covariance), seen)
         if local.newest < self._resting_until or not (is_new or self._finder.is_suspicious):
             return None

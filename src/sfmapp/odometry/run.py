@@ -137,6 +137,8 @@ class Odometry:
     def process(self, frame: Frame) -> FrameRecord:
         """Find the pose of the next frame."""
         start = time.thread_time()
+        belief = self.recognition.belief
+        num_looks = 0 if belief is None else belief.num_looks
         view = View(
             frame.idx,
             frame.timestamp_s,
@@ -155,6 +157,7 @@ class Odometry:
             frame.idx, frame.name, frame.shown_s, record.state, frame.images[0],
             self.tracked.tracks.xy.astype(np.float32), self.tracked.is_mapped, record.live, record.map_idx,
             record.cpu_s, math.nan if frame.captured_s is None else time.monotonic() - frame.captured_s,
+            None if belief is None or belief.num_looks == num_looks else belief.state(),
         )  # fmt: skip
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
         return record

@@ -14,6 +14,28 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class BeliefState:
+    """Where the camera may be in a known map, after a frame was held against it.
+
+    Attributes:
+        pose: (P, 7) cam_from_world of particles of all places, in the known map. weight: (P,) with the probabilities of
+            the places in it; sum 1 less ``not_in_map``. mode: (P,) which place.
+        probability: (M,) of the places. best: (M, 7) their mean poses.
+        not_in_map: probability. decided: the place that is believed, -1 for none.
+        point_xyz: (N, 3) landmarks of the known map.
+    """
+
+    pose: Array
+    weight: Array
+    mode: NDArray[np.int64]
+    probability: Array
+    best: Array
+    not_in_map: float
+    decided: int
+    point_xyz: Array
+
+
+@dataclass(frozen=True)
 class FrameSnapshot:
     """One frame, with every ``advanced`` event of stage ``odometry``. Listeners may keep the arrays.
 
@@ -26,6 +48,7 @@ class FrameSnapshot:
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
         cpu_s: CPU seconds of tracking, back end not included.
         latency_s: of a live source, seconds from when the frame came until its pose was known; NaN of recorded ones.
+        belief: where in a known map it might be; None where it was not held against one.
     """
 
     frame_idx: int
@@ -39,6 +62,7 @@ class FrameSnapshot:
     map_idx: int
     cpu_s: float
     latency_s: float = math.nan
+    belief: BeliefState | None = None
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event
+from sfmapp.geometry import rigid3
 from sfmapp.images.addresses import without_credentials
 from sfmapp.odometry.result import FrameState
-from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
+from sfmapp.odometry.snapshot import BeliefState, FrameSnapshot, MapSnapshot
 from sfmapp.packages import MissingPackageError, require
 from sfmapp.viewer.listener import MAX_MESSAGES
 from sfmapp.viewer.messages import write_message
@@ -78,6 +79,7 @@ class LiveView:
         self._count = self._num_messages = 0
         self._with_next_frame: list[dict[str, Any]] = []
         self._problem = ""
+        self._has_belief = False
 
     @property
     def is_recording(self) -> bool:
@@ -179,6 +181,9 @@ class LiveView:
             num_mapped=0 if is_lost else int(np.count_nonzero(seen.is_mapped)), map_idx=seen.map_idx,
             cam_from_world=seen.cam_from_world, cpu_s=seen.cpu_s,
         )  # fmt: skip
+        if seen.belief is not None:
+            self._send("belief", **_belief_message(seen.belief, with_landmarks=not self._has_belief))
+            self._has_belief = True
         self._send_decisions()
 
     def _send_decisions(self) -> None:
@@ -190,6 +195,19 @@ class LiveView:
     def _send(self, kind: str, **content: Any) -> None:
         assert self._send_queue is not None
         self._send_queue.put({"kind": kind, **content})
+
+
+def _belief_message(seen: BeliefState, *, with_landmarks: bool) -> dict[str, Any]:
+    return {
+        "center": rigid3.center(seen.pose).astype(np.float32),
+        "weight": seen.weight.astype(np.float32),
+        "mode": seen.mode,
+        "probability": seen.probability,
+        "best": seen.best,
+        "decided": seen.decided,
+        "not_in_map": seen.not_in_map,
+        "point_xyz": seen.point_xyz.astype(np.float32) if with_landmarks else None,
+    }
 
 
 def _map_message(seen: MapSnapshot) -> dict[str, Any]:

@@ -9,6 +9,7 @@ Entities (everything on the timelines ``frame`` and ``time``)::
     world/scene/final/map0/...      the result
     image, image/mapped, image/tracked   the frame, points that the pose was measured with, and the other tracks
     plots/points, time, error       numbers by frame
+    known/landmarks, particles, places     a known map, and where the camera may be in it
     log                             decisions
 """
 
@@ -42,7 +43,10 @@ FRAME_TIMELINE, TIME_TIMELINE = "frame", "time"
 _IMAGE_SIDE_PX, _IMAGE_QUALITY = 640, 70
 _BLUE, _ORANGE, _GREEN, _GREY, _RED = (80, 150, 255), (255, 150, 40), (90, 200, 120), (140, 140, 150), (235, 70, 60)
 _LIVE, _FINAL = "world/scene/live", "world/scene/final"
-_MAX_FINAL_POINTS = 300_000
+_MAX_FINAL_POINTS, _MAX_KNOWN_POINTS = 300_000, 30_000
+# Where a known map is looked at from, and colours of the places that the camera may be at.
+_ABOVE = np.array([-0.3, -0.3, 1.0]) / np.linalg.norm([-0.3, -0.3, 1.0])
+_PLACES = np.array([_ORANGE, _BLUE, (200, 120, 230), (230, 210, 80), (120, 220, 220)])
 # Points move with every keyframe; drawn as often they would take sixty megabytes of a recording of a thousand frames.
 DRAW_EVERY = 8
 
@@ -58,7 +62,7 @@ class LiveDrawing:
         self._ground_truth: Trajectory | None = None
         self._alignment: Alignment = "sim3"
         self._count = self._drawn_at = 0
-        self._is_lost = False
+        self._is_lost = self._has_known_map = False
         self._begin_s = 0.0
         self._last = rigid3.IDENTITY
         self._newest: Mapping[str, Any] | None = None
@@ -67,6 +71,7 @@ class LiveDrawing:
         self._rotation = turn_to_z(np.array([0.0, -1.0, 0.0]))
         self._drawers = {
             "begin": self._begin, "frame": self._frame, "map": self._map, "log": self._log, "end": self._end,
+            "belief": self._belief,
         }  # fmt: skip
 
     def draw(self, message: Mapping[str, Any]) -> None:
@@ -90,7 +95,7 @@ class LiveDrawing:
             self._ground_truth = Trajectory.from_cam_from_world(poses, message["ground_truth_times"])
             self._alignment = "se3" if message["is_metric"] else "sim3"
         recording.send_recording_name(printable(message["title"]))
-        recording.send_blueprint(blueprint(None, self._has_ground_truth), make_active=True, make_default=True)
+        recording.send_blueprint(self._blueprint(None), make_active=True, make_default=True)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # cameras are taken to start level until more of them are known
         recording.log("world/scene", rr.Transform3D(mat3x3=self._rotation), static=True)
@@ -177,7 +182,45 @@ class LiveDrawing:
             self._shown_extent = extent
             heading = rigid3.rotation_matrix(rigid3.compose(ours.placement, rigid3.inverse(poses[-1])))[:, 2]
             eye = frame_view(body, eye_direction(self._rotation @ heading))
-            self._recording.send_blueprint(blueprint(eye, self._has_ground_truth), make_active=True, make_default=True)
+            self._recording.send_blueprint(self._blueprint(eye), make_active=True, make_default=True)
+
+    def _belief(self, message: Mapping[str, Any]) -> None:
+        """Particles in a known map, each in the colour of its place, and the places with their probabilities."""
+        recording = self._recording
+        if message["point_xyz"] is not None:
+            self._draw_known_map(message["point_xyz"])
+        probability, is_decided = message["probability"], np.arange(len(message["probability"])) == message["decided"]
+        colors = np.where(is_decided[:, None], _GREEN, np.resize(_PLACES, (len(probability), 3))).astype(np.uint8)
+        # what weighs little is small
+        radii = -np.clip(400.0 * message["weight"], 1.5, 5.0)
+        recording.log("known/particles", rr.Points3D(message["center"], colors=colors[message["mode"]], radii=radii))
+        lines = frustum_lines(self._camera, message["best"], self._known_frustum)
+        labels = [f"{p:.2g}" for p in probability]
+        places = rr.LineStrips3D(lines, colors=colors, labels=labels, radii=rr.Radius.ui_points(1.5))
+        recording.log("known/places", places)
+        recording.log("plots/belief/elsewhere", rr.Scalars(message["not_in_map"]))
+        recording.log("plots/belief/best", rr.Scalars(float(probability.max()) if len(probability) else 0.0))
+
+    def _draw_known_map(self, point_xyz: Array) -> None:
+        """The landmarks of a known map, seen from above, in a view of their own."""
+        self._has_known_map, recording = True, self._recording
+        xyz = np.asarray(point_xyz[:: max(1, -(-len(point_xyz) // _MAX_KNOWN_POINTS))], np.float64)
+        low, high = np.percentile(xyz, [5, 95], axis=0)
+        self._known_frustum = 0.04 * float(np.linalg.norm(high - low))
+        turned = xyz @ self._rotation.T
+        self._known_eye = frame_view(turned[((xyz >= low) & (xyz <= high)).all(1)], _ABOVE)
+        recording.send_blueprint(self._blueprint(None), make_active=True, make_default=True)
+        recording.log("known", rr.Transform3D(mat3x3=self._rotation), static=True)
+        recording.log("known", rr.TransformAxes3D(1e-6), static=True)
+        landmarks = rr.Points3D(xyz, colors=_GREY, radii=rr.Radius.ui_points(1.0))
+        recording.log("known/landmarks", landmarks, static=True)
+        for name, color, label in (("best", _GREEN, "likeliest place"), ("elsewhere", _GREY, "not in the map")):
+            series = rr.SeriesLines(colors=[color], names=[label], widths=[1.5])
+            recording.log(f"plots/belief/{name}", series, static=True)
+
+    def _blueprint(self, eye: tuple[Array, Array] | None) -> rrb.Blueprint:
+        known_eye = self._known_eye if self._has_known_map else None
+        return blueprint(eye, self._has_ground_truth, known_eye)
 
     def _log(self, message: Mapping[str, Any]) -> None:
         self._recording.log("log", rr.TextLog(message["text"], level=message["level"]))
@@ -208,7 +251,7 @@ class LiveDrawing:
         recording.log("world/scene", rr.Transform3D(mat3x3=rotation), static=True)
         direction = eye_direction((headings @ rotation.T).mean(0))
         eye = frame_view(np.concatenate(bodies) @ rotation.T, direction)
-        recording.send_blueprint(blueprint(eye, self._has_ground_truth), make_active=True, make_default=True)
+        recording.send_blueprint(self._blueprint(eye), make_active=True, make_default=True)
 
     def _lay_live_on_final(self, message: Mapping[str, Any]) -> None:
         """Scale, and what was corrected in the end, also hold for what was drawn before: nothing jumps when played."""
@@ -381,15 +424,19 @@ def final_frustum(keyframes: Array, xyz: Array) -> float:
     return float(np.clip(FRUSTUM_SHARE * 3 * nearest, 0.004 * size, max(0.6 * apart, 0.004 * size))) or 0.1
 
 
-def blueprint(eye: tuple[Array, Array] | None, has_ground_truth: bool) -> rrb.Blueprint:
-    """The layout, looking at the map from an eye at a target."""
-    controls = None
-    if eye is not None:
-        controls = rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0))
-    world = rrb.Spatial3DView(origin="world", name="Map and trajectory", eye_controls=controls, line_grid=False)
-    image = rrb.Spatial2DView(origin="image", name="Frame: green points are in the map, orange ones are not yet")
+def blueprint(
+    eye: tuple[Array, Array] | None, has_ground_truth: bool, known_eye: tuple[Array, Array] | None = None
+) -> rrb.Blueprint:
+    """The layout, looking at the map from an eye at a target, and beside the frame at a known map, if there is one."""
+    world = _space("world", "Map and trajectory", eye)
+    image: rrb.Spatial2DView | rrb.Horizontal = rrb.Spatial2DView(
+        origin="image", name="Frame: green points are in the map, orange ones are not yet"
+    )
+    if known_eye is not None:
+        image = rrb.Horizontal(image, _space("known", "Known map: where the camera may be", known_eye))
     shown = [("points", "Points"), ("time", "CPU time of tracking (ms)")]
     shown += [("error", "Distance from the ground truth (m)")] if has_ground_truth else []
+    shown += [("belief", "Probability: place in the known map")] if known_eye is not None else []
     plots = [rrb.TimeSeriesView(origin=f"plots/{name}", name=label) for name, label in shown]
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     log = rrb.TextLogView(origin="log", name="Decisions", columns=columns)
@@ -404,3 +451,10 @@ def blueprint(eye: tuple[Array, Array] | None, has_ground_truth: bool) -> rrb.Bl
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,
     )
+
+
+def _space(origin: str, name: str, eye: tuple[Array, Array] | None) -> rrb.Spatial3DView:
+    controls = None
+    if eye is not None:
+        controls = rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=(0.0, 0.0, 1.0))
+    return rrb.Spatial3DView(origin=origin, name=name, eye_controls=controls, line_grid=False)

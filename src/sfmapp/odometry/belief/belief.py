@@ -34,6 +34,7 @@ from sfmapp.odometry.loops.relocalize import (
 )
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.report import BeliefReport
+from sfmapp.odometry.snapshot import BeliefState
 
 Array = NDArray[np.float64]
 
@@ -106,26 +107,6 @@ class Mode:
         return self.particles.mean()[0]
 
 
-@dataclass(frozen=True)
-class BeliefState:
-    """What is believed after a look.
-
-    Attributes:
-        pose: (P, 7) particles of all places, weight: (P,) with the probabilities of the places in it; sum 1 less
-            ``not_in_map``. mode: (P,) which place.
-        probability: (M,) of the places. place: (M,) frames of the known keyframes that they are nearest to.
-        not_in_map: probability. decided: the place that is believed, -1 for none.
-    """
-
-    pose: Array
-    weight: Array
-    mode: NDArray[np.int64]
-    probability: Array
-    place: NDArray[np.int64]
-    not_in_map: float
-    decided: int
-
-
 class PlaceBelief:
     """Of one camera in one known map. What is found depends on the order of the calls alone.
 
@@ -135,6 +116,7 @@ class PlaceBelief:
 
     Attributes:
         modes: the places that it may be at. decided: the one that is believed, None while that is open.
+        num_looks: images that were held against the map.
     """
 
     def __init__(
@@ -144,7 +126,7 @@ class PlaceBelief:
         self._scene = KnownScene(keyframes, places, pictures)
         self._places, self._rng = places, np.random.default_rng([seed, 0x9A27])
         self._options = RelocalizeOptions()
-        self._num_looks = self._num_open = self._max_particles = 0
+        self.num_looks = self._num_open = self._max_particles = 0
         self._num_looks_to_decision: int | None = None
         self.modes: list[Mode] = []
         self.decided: Mode | None = None
@@ -196,31 +178,28 @@ class PlaceBelief:
         self._count()
 
     def _count(self) -> None:
-        self._num_looks += 1
+        self.num_looks += 1
         self._num_open += self.decided is None and sum(m.score.support > 0.0 for m in self.modes) > 1
         self._max_particles = max(self._max_particles, sum(len(m.particles) for m in self.modes))
         if self.decided is not None and self._num_looks_to_decision is None:
-            self._num_looks_to_decision = self._num_looks
+            self._num_looks_to_decision = self.num_looks
 
     def state(self) -> BeliefState:
         """What is believed now."""
         sets = [mode.particles for mode in self.modes]
-        size = [len(s) for s in sets]
         return BeliefState(
-            np.concatenate([s.pose for s in sets]) if sets else np.zeros((0, 7)),
-            np.concatenate([m.probability * m.particles.weight for m in self.modes]) if sets else np.zeros(0),
-            np.repeat(np.arange(len(sets)), size),
-            np.array([m.probability for m in self.modes]),
-            np.array([m.place for m in self.modes], np.int64),
-            self.not_in_map,
-            next((n for n, m in enumerate(self.modes) if m is self.decided), -1),
-        )
+            np.concatenate([np.zeros((0, 7)), *[s.pose for s in sets]]),
+            np.concatenate([np.zeros(0), *[m.probability * m.particles.weight for m in self.modes]]),
+            np.repeat(np.arange(len(sets)), [len(s) for s in sets]), np.array([m.probability for m in self.modes]),
+            np.array([m.pose for m in self.modes]).reshape(-1, 7), self.not_in_map,
+            next((n for n, m in enumerate(self.modes) if m is self.decided), -1), self._scene.point_xyz,
+        )  # fmt: skip
 
     def report(self) -> BeliefReport:
         """What is to be said of it in the end."""
         likely = sorted((m for m in self.modes if m.probability > MAX_DOUBT), key=lambda m: -m.probability)
         return BeliefReport(
-            num_looks=self._num_looks, num_open=self._num_open, max_doubt=MAX_DOUBT, max_particles=self._max_particles,
+            num_looks=self.num_looks, num_open=self._num_open, max_doubt=MAX_DOUBT, max_particles=self._max_particles,
             places=[self._scene.name_of(m.place) for m in likely], not_in_map=self.not_in_map,
             probabilities=[m.probability for m in likely], num_looks_to_decision=self._num_looks_to_decision,
         )  # fmt: skip

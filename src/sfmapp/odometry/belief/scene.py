@@ -31,7 +31,7 @@ class KnownScene:
 
     Attributes:
         frame_idx: (L,) of the keyframes that are places. depth: (L,) median depths of what they see.
-        look_alikes: what it holds twice.
+        look_alikes: what it holds twice. point_xyz: (N, 3) its landmarks.
     """
 
     def __init__(self, keyframes: KeyframeMap, places: PlaceIndex, pictures: Mapping[int, Bytes]) -> None:
@@ -43,6 +43,8 @@ class KnownScene:
         self.depth = keyframe_depths(keyframes)[known]
         self._center, self._axis = rigid3.center(pose), rigid3.rotation_matrix(pose)[:, 2]
         self._centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]).reshape(-1, 7))
+        xyz = keyframes.point_xyz[: keyframes.num_points]
+        self.point_xyz = xyz[np.isfinite(xyz[:, 0])]
         self._points: dict[int, LocalPoints] = {}
 
     def depth_at(self, frame_idx: int) -> float:
