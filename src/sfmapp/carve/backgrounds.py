@@ -37,8 +37,6 @@ _WINDOW = 3
 # specks and holes below this share of the object are filled: a hole that is none pierces the solid, while one that is
 # there is seen larger elsewhere
 _SPECK = 1e-3
-# photographs that colours are learned from, at most
-MAX_LEARNED = 48
 
 
 @dataclass(frozen=True)
@@ -58,9 +56,9 @@ class ColorModel:
 
 def learn_colors(pictures: Sequence[Pixels]) -> ColorModel | None:
     """Colours of object and background of photographs (H, W, 3) of one object; None if nothing stands out anywhere."""
-    colors = [_color_index(picture) for picture in pictures]
+    colors = [color_index(picture) for picture in pictures]
     bands = [_border(index.shape) for index in colors]
-    background = _histogram([index[band] for index, band in zip(colors, bands, strict=True)], shaded=True)
+    background = histogram([index[band] for index, band in zip(colors, bands, strict=True)], shaded=True)
     masks = [(background[index] < _RARE) & ~band for index, band in zip(colors, bands, strict=True)]
     model = None
     for _ in range(_ROUNDS):
@@ -70,13 +68,13 @@ def learn_colors(pictures: Sequence[Pixels]) -> ColorModel | None:
         masks = [_smooth_evidence(index, model) > 0.0 for index in colors]
         if all(mask.all() for mask in masks):
             return None
-        background = _histogram([index[~mask] for index, mask in zip(colors, masks, strict=True)], shaded=True)
+        background = histogram([index[~mask] for index, mask in zip(colors, masks, strict=True)], shaded=True)
     return model
 
 
 def object_mask(picture: Pixels, model: ColorModel) -> Mask:
     """(H, W) bool: what of a photograph (H, W, 3) is the object by its colours, without specks and small holes."""
-    return without_specks(_smooth_evidence(_color_index(picture), model) > 0.0)
+    return without_specks(_smooth_evidence(color_index(picture), model) > 0.0)
 
 
 def without_specks(mask: Mask) -> Mask:
@@ -95,7 +93,7 @@ def _small_pieces(mask: Mask, least: int) -> Mask:
     return np.asarray(is_small[labels])
 
 
-def _color_index(picture: Pixels) -> NDArray[np.int32]:
+def color_index(picture: Pixels) -> NDArray[np.int32]:
     """(H, W) place of each pixel's colour in a histogram."""
     levels = (picture >> (8 - _BITS)).astype(np.int32)
     return np.asarray((levels[..., 0] << (2 * _BITS)) | (levels[..., 1] << _BITS) | levels[..., 2])
@@ -108,7 +106,7 @@ def _border(shape: tuple[int, ...]) -> Mask:
     return band
 
 
-def _histogram(colors: Sequence[NDArray[np.int32]], *, shaded: bool) -> NDArray[np.float64]:
+def histogram(colors: Sequence[NDArray[np.int32]], *, shaded: bool) -> NDArray[np.float64]:
     """(32768,) probability of colours, smoothed by one level."""
     from scipy.ndimage import gaussian_filter
 
@@ -128,7 +126,7 @@ def _histogram(colors: Sequence[NDArray[np.int32]], *, shaded: bool) -> NDArray[
 def _model_of(
     colors: Sequence[NDArray[np.int32]], masks: Sequence[Mask], background: NDArray[np.float64]
 ) -> ColorModel:
-    found = _histogram([index[mask] for index, mask in zip(colors, masks, strict=True)], shaded=False)
+    found = histogram([index[mask] for index, mask in zip(colors, masks, strict=True)], shaded=False)
     evidence = np.log(found + _STRAY) - np.log(background + _STRAY)
     error = float(0.5 * np.minimum(found, background).sum())
     return ColorModel(evidence.astype(np.float32), error, _brightness(background) < _DARK * _brightness(found))

@@ -47,13 +47,36 @@ def cut_by_rectangle(picture: Pixels, rectangle: tuple[int, int, int, int]) -> M
     return _cut(small, labels, (slice(None), slice(None)), within)
 
 
+def cut_by_labels(small: Pixels, rough: Mask, *, surely: Mask, never: Mask, size: tuple[int, int]) -> Mask:
+    """(H, W), by ``size``, the object in a small picture (h, w, 3), about where a mask (h, w) says, surely in a second
+    and never in a third one."""
+    import cv2
+
+    labels = np.where(rough, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[surely] = cv2.GC_FGD
+    labels[never] = cv2.GC_BGD
+    otherwise = np.asarray(cv2.resize(rough.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0)
+    return _cut(small, labels, (slice(None), slice(None)), otherwise)
+
+
+def shrunk_picture(picture: Pixels) -> Pixels:
+    """A picture (H, W, 3) as small as it is cut."""
+    import cv2
+
+    return np.asarray(cv2.resize(picture, _shrunk_size(picture.shape), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _shrunk_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    scale = min(1.0, _LONGEST / max(shape[:2]))
+    return max(1, round(shape[1] * scale)), max(1, round(shape[0] * scale))
+
+
 def _shrunk(picture: Pixels, mask: Mask) -> tuple[Pixels, Mask]:
     import cv2
 
-    scale = min(1.0, _LONGEST / max(mask.shape))
-    size = (max(1, round(mask.shape[1] * scale)), max(1, round(mask.shape[0] * scale)))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return small, np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5)
+    size = _shrunk_size(mask.shape)
+    small = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return shrunk_picture(picture), np.asarray(small > 0.5)
 
 
 def _span(places: NDArray[np.int64], pad: int) -> slice:

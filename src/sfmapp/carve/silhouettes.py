@@ -1,7 +1,7 @@
 """What a photograph says of where the object is: the signed distance of each pixel to its outline.
 
 :func:`find_silhouettes` takes what there is: an alpha channel, mask files, photographs that are masks themselves, or
-the background, whose colours are learned from all photographs together.
+the background: as it is where the camera stands still, otherwise its colours, learned from all photographs together.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.backgrounds import MAX_LEARNED, ColorModel, learn_colors, object_mask, without_specks
+from sfmapp.carve.background_search import MAX_LEARNED, Background, find_background, spread
+from sfmapp.carve.backgrounds import without_specks
 from sfmapp.carve.consistency import compare
-from sfmapp.carve.graph_cut import cut_by_mask, cut_by_rectangle
+from sfmapp.carve.graph_cut import cut_by_rectangle
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
 from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
 from sfmapp.carve.views import View, project_points
-from sfmapp.errors import InputError, listed
+from sfmapp.errors import InputError, UsageError, listed
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
 from sfmapp.option_checks import check_options
 
@@ -36,7 +37,7 @@ STAGE = "masks"
 T = TypeVar("T")
 
 # standard deviations of outlines against exact ones: tests/test_carve_outlines.py
-_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3, "dark background": 0.3, "grabcut": 0.5}
+_SIGMA_PX = {"alpha": 0.1, "mask": 0.2, "background": 0.3, "dark background": 0.3}
 # more of the edge of the picture than this inside, and more than of the whole: the mask is the background's
 _INVERTED = 0.5
 # what is seen of the object is at least this share of a photograph, for outlines to mean anything
@@ -44,12 +45,6 @@ _LEAST_SHARE = 1e-5
 # share of pixels that are black or white to the last level, from which on a photograph is a mask itself
 _TWO_VALUED = 0.98
 _NAMES_SHOWN = 3
-# colours that overlap by more than this are not all: neighbours that look alike are kept together then
-_TELLING = 0.005
-# and by more than this, they tell little: each photograph is cut by itself, within its edges. Masks by colours came to
-# 0.02 to 0.55 IoU at 2.9 to 16 % (two rendered solids before ten backgrounds), cuts to 0.84 to 0.999; by colours to
-# 0.97 and more at 1.6 and 2.1 %
-_ALIKE = 0.025
 # share of the shorter side along the edges where GrabCut expects no object (benchmarks/masks.py)
 _EDGE = 0.04
 # points that tell where the object is
@@ -66,12 +61,20 @@ class MaskOptions:
         mask_source: Where the object is told from: alpha, mask files, or the colours of the background; auto takes the
             first that is there. grabcut, which has to be asked for, cuts it out of each photograph by itself, within
             what the points of a reconstruction span, or all of the picture but its edges.
+        background: A photograph of the background without the object, from where all photographs were taken; what
+            differs from it is the object. None, and a background that stands still is found in the photographs.
     """
 
     mask_source: Literal["auto", "alpha", "mask", "background", "grabcut"] = "auto"
+    background: str | None = None
 
     def __post_init__(self) -> None:
         check_options("masks", self, {})
+        if self.background is not None and self.mask_source not in ("auto", "background"):
+            raise UsageError(
+                f"masks: a photograph of the background tells nothing where mask_source is {self.mask_source}",
+                "leave one of both out",
+            )
 
 
 @dataclass(frozen=True)
@@ -116,15 +119,18 @@ def find_silhouettes(
     events.started(STAGE, f"silhouettes in {len(records)} photographs", total=len(records))
     source = _choose_source(records, options)
     warnings = _useless_alpha(records, source, options, events)
-    model = _learn(records, source, workers, events)
-    if model is not None and model.error > _ALIKE:
-        source = "grabcut"
-        warnings.append(_cut_instead(model, events))
+    background, color_error = None, None
+    if source == "background":
+        pictures = _each(read_rgb, spread(records, MAX_LEARNED), workers, lambda record: events.raise_if_cancelled())
+        background, color_error, more = find_background(records, pictures, options.background, events)
+        warnings += more
+        if background is None:
+            source = "grabcut"
     index = {record.name: i for i, record in enumerate(records)}
 
     def work(record: ImageRecord) -> tuple[Silhouette, PhotographMask]:
         view = None if views is None else views[index[record.name]]
-        return _with_problem(record, _find(record, source, model, _rectangle(record, view, points)), source)
+        return _with_problem(record, _find(record, source, background, _rectangle(record, view, points)), source)
 
     found = _each(work, records, workers, lambda record: events.advanced(STAGE, message=record.name))
     warnings += _warn([entry for _, entry in found], events)
@@ -133,8 +139,8 @@ def find_silhouettes(
         warnings += more
     silhouettes, entries = [each for each, _ in found], [entry for _, entry in found]
     report = MasksReport(
-        masks=entries, color_error=None if model is None else model.error, is_compared=views is not None,
-        warnings=warnings, wall_s=round(time.monotonic() - start, 3),
+        masks=entries, color_error=color_error, is_compared=views is not None, warnings=warnings,
+        wall_s=round(time.monotonic() - start, 3),
     )  # fmt: skip
     events.finished(STAGE, f"{len(entries)} silhouettes by {source}", **report)
     return silhouettes, report
@@ -161,13 +167,15 @@ def _choose_source(records: Sequence[ImageRecord], options: MaskOptions) -> str:
     """What tells the object, for all photographs alike."""
     if options.mask_source != "auto":
         return options.mask_source
+    if options.background is not None:
+        return "background"
     if any(_has_mask(record) for record in records):
         return "mask"
     # most often the first of three tells; all are read only where it never does
-    asked = (*_spread(records, 3), *records)
+    asked = (*spread(records, 3), *records)
     if any(read_with_alpha(record)[1] is not None for record in asked if record.has_alpha):
         return "alpha"
-    if all(is_mask(read_rgb(record)) for record in _spread(records, 3)):
+    if all(is_mask(read_rgb(record)) for record in spread(records, 3)):
         return "picture"
     return "background"
 
@@ -200,46 +208,8 @@ def is_mask(picture: NDArray[np.uint8]) -> bool:
     return bool(min(num_black, num_white) > 0 and white > 0 and num_black + num_white >= _TWO_VALUED * gray.size)
 
 
-def _spread(records: Sequence[ImageRecord], num: int) -> list[ImageRecord]:
-    """So many of the photographs, evenly from first to last."""
-    picked = np.unique(np.linspace(0, len(records) - 1, min(num, len(records))).round().astype(int))
-    return [records[i] for i in picked]
-
-
-def _learn(records: Sequence[ImageRecord], source: str, workers: int, events: Events) -> ColorModel | None:
-    """Colours of object and background, where these are asked.
-
-    Raises:
-        InputError: nothing stands out of the background.
-    """
-    if source != "background":
-        return None
-    pictures = _each(read_rgb, _spread(records, MAX_LEARNED), workers, lambda record: events.raise_if_cancelled())
-    model = learn_colors(pictures)
-    if model is None:
-        raise InputError(
-            f"no object stands out of the background of {records[0].name} and {len(records) - 1} others",
-            "give masks (--mask-path), or photographs with an alpha channel",
-        )
-    events.decided(
-        STAGE, f"object and background by their colours, which overlap by {100 * model.error:.1f} %",
-        color_error=model.error, num_photographs=len(pictures),
-    )  # fmt: skip
-    return model
-
-
-def _cut_instead(model: ColorModel, events: Events) -> str:
-    """Say that colours tell the object from its background badly."""
-    line = (
-        f"object and background look alike, their colours overlap by {100 * model.error:.1f} %: each photograph is cut "
-        "by itself, where nothing of the object reaches its edges"
-    )
-    events.warned(STAGE, f"{line}: look at the outlines, or give masks (--mask-path)")
-    return line
-
-
 def _find(
-    record: ImageRecord, source: str, model: ColorModel | None, rectangle: tuple[int, int, int, int]
+    record: ImageRecord, source: str, background: Background | None, rectangle: tuple[int, int, int, int]
 ) -> _Found | None:
     """What the source says of a photograph; None if it says nothing."""
     if source == "mask":
@@ -255,11 +225,9 @@ def _find(
     if source == "grabcut":
         coverage = refined_coverage(picture, without_specks(cut_by_rectangle(picture, rectangle)))
         return _Found(coverage, "grabcut")
-    assert model is not None
-    mask = object_mask(picture, model)
-    if model.error > _TELLING:
-        mask = without_specks(cut_by_mask(picture, mask))
-    return _Found(refined_coverage(picture, mask), "dark background" if model.is_dark else "background")
+    assert background is not None
+    cut = background.cut(picture)
+    return None if cut is None else _Found(refined_coverage(picture, cut), background.source)
 
 
 def _rectangle(record: ImageRecord, view: View | None, points: NDArray[np.float64] | None) -> tuple[int, int, int, int]:
@@ -294,7 +262,10 @@ def _with_problem(record: ImageRecord, found: _Found | None, wanted: str) -> tup
     share, border_share = float(inside.mean()), float(edge.mean())
     problem = ""
     if found.source == "none":
-        problem = "has no alpha channel that tells the object" if wanted == "alpha" else "has no mask"
+        problem = {
+            "alpha": "has no alpha channel that tells the object",
+            "background": "does not show the background of the others, or of the photograph of it",
+        }.get(wanted, "has no mask")
     elif share < _LEAST_SHARE:
         problem = "is empty"
     elif share > 1.0 - _LEAST_SHARE:

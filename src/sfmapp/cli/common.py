@@ -50,12 +50,16 @@ def add_object_flags(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--mask-source", metavar="NAME", help="alpha, mask, background or grabcut; default: what is there"
     )
+    group.add_argument(
+        "--background", metavar="FILE", help="photograph without the object, from where all others were taken"
+    )
 
 
 def object_options(args: argparse.Namespace) -> dict[str, str | None]:
     """What flags of :func:`add_object_flags` set, for :func:`options_of`."""
     return {
         "images.camera": args.camera, "images.mask_path": args.mask_path, "masks.mask_source": args.mask_source,
+        "masks.background": args.background,
     }  # fmt: skip
 
 

@@ -27,8 +27,9 @@ examples:
   sfmapp masks photos/ -o clean/ --mask-path rough/   masks that there are: checked, spills and holes mended
   sfmapp reconstruct turntable/ -o out/ --mask-path masks/masks
 
-An alpha channel or mask files are taken where they are there. Otherwise the edges of the pictures show the background,
-and its colours and the object's are learned from all photographs together.
+An alpha channel or mask files are taken where they are there. Otherwise the edges of the pictures show the background:
+where they are the same in all, the camera stands still, and what hides the background is the object (--background: a
+photograph without it); if not, the colours of both are learned from all photographs together.
 
 Writes
   DIR/masks/NAME.png   white where the object is, for --mask-path, COLMAP, and splatting tools

@@ -130,9 +130,10 @@ def with_absolute_paths(options: Options) -> Options:
     poses = _with_absolute_paths(options.poses, "file")
     sequence = _with_absolute_paths(options.sequence, "camera", "imu", "ground_truth")
     odometry = _with_absolute_paths(options.odometry, "known_map")
+    masks = _with_absolute_paths(options.masks, "background")
     gps = options.gps if options.gps.source in ("exif", "none") else _with_absolute_paths(options.gps, "source")
     return dataclasses.replace(
-        options, images=images, control=control, poses=poses, sequence=sequence, odometry=odometry, gps=gps
+        options, images=images, control=control, poses=poses, sequence=sequence, odometry=odometry, masks=masks, gps=gps
     )
 
 
