@@ -141,7 +141,11 @@ def improve_rows(
             if deviation < f32(LEAST_DEVIATION) * images.noise[0]:
                 continue
             u, v = f32(x), f32(y)
-            own = _score(images, u, v, best_at, work, slot_at, rho_at) - _off(sure[y, x], best[0], unit) + LEAST_GAIN
+            # what the round before left, and zero only at the start
+            own = score[y, x]
+            if own == f32(0.0):
+                own = _score(images, u, v, best_at, work, slot_at, rho_at)
+            own += LEAST_GAIN - _off(sure[y, x], best[0], unit)
             for direction in range(4):
                 cx, cy = _proposer(score, x, y, direction)
                 if cx < 0 or not np.isfinite(planes[cy, cx, 0]):
