@@ -17,6 +17,7 @@ from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.residual_memory import NOT_KNOWN
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.scene.rig import Rig
@@ -24,6 +25,8 @@ from sfmapp.scene.rig import Rig
 Array = NDArray[np.float64]
 WIDTH, HEIGHT, FPS = 160, 100, 10.0
 POINTS_PER_KEYFRAME = 60
+# Of live poses: a centimetre and a milliradian, in the unit of the map.
+COVARIANCE = np.diag([1e-3] * 3 + [0.01] * 3) ** 2
 
 
 def path(num: int) -> Array:
@@ -104,7 +107,19 @@ class FakeRunner:
                 pose, xy = self.poses[frame.idx], self._track(frame, map_idx, sequence.rig, events)
             is_mapped = np.arange(len(xy)) % 3 > 0
             snapshot = FrameSnapshot(
-                frame.idx, frame.name, frame.timestamp_s, state, frame.images[0], xy, is_mapped, pose, map_idx, 0.01
+                frame.idx,
+                frame.name,
+                frame.timestamp_s,
+                state,
+                frame.images[0],
+                xy,
+                is_mapped,
+                pose,
+                COVARIANCE,
+                NOT_KNOWN,
+                rigid3.IDENTITY,
+                map_idx,
+                0.01,
             )
             events.advanced("odometry", snapshot=snapshot)
             rows.append((frame.idx, frame.name, frame.timestamp_s, state, map_idx, pose))

@@ -72,7 +72,7 @@ INNER_FLOORS = {
         ("result", "state"),
         ("inertial",),
         ("report",),
-        ("options",),
+        ("options", "residual_memory"),
     ),
     "pipelines": (
         ("*",),

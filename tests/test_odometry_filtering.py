@@ -9,24 +9,34 @@ import pytest
 from scipy.stats import chi2
 
 from inertial_flights import ACCEL_BIAS, GRAVITY, GYRO_BIAS, IMU_FROM_CAM, Flight
-from sfmapp.adjust.factors import gtsam_pose
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.inertial.filtering import FilteredTrajectory, InertialSensor, consistency, filter_trajectory
-from sfmapp.odometry.inertial.graph import Placement
+from sfmapp.images.sequence import Imu
+from sfmapp.odometry.inertial.filtering import (
+    INDEPENDENT,
+    FilteredTrajectory,
+    InertialFilter,
+    InertialSensor,
+    Shared,
+    consistency,
+    filter_trajectory,
+)
 from sfmapp.odometry.inertial.integration import ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA
-from sfmapp.odometry.inertial.scale import ScaleEstimate, ScaleRefusal
-from sfmapp.odometry.report import InertialEvidence
-from sfmapp.odometry.result import MapResult, OdometryResult
-from sfmapp.pipelines.odometry.filtering import COLUMNS, filter_largest_map, filtered_csv
-from sfmapp.scene.reconstruction import Reconstruction
-from sfmapp.scene.tracks import make_tracks
+from sfmapp.odometry.inertial.live_start import SHORTEST_S
+from sfmapp.odometry.inertial.scale import scale_covariance
+from sfmapp.odometry.inertial.smoothing import read_measured, unknown_rates
+from sfmapp.odometry.report import FilterReport
+from sfmapp.odometry.residual_memory import Correlation, ResidualMemory
+from sfmapp.odometry.result import FrameState
+from sfmapp.odometry.snapshot import FrameSnapshot
+from sfmapp.pipelines.odometry.filtering import COLUMNS, LiveFilter, SharedErrors, filtered_csv
 from test_odometry_smoothing import perturbed, tangent
 
 RATE_HZ, FPS, DURATION_S = 100.0, 20.0, 12.0
 DOWN = np.array([0.0, 0.0, -GRAVITY])
 SIGMA = np.r_[np.full(3, np.radians(0.1)), np.full(3, 0.01)]
 TILT_SIGMA = np.radians(0.5)
+LATE_S = 0.03
 
 
 class Case:
@@ -159,7 +169,7 @@ def test_silence_of_the_sensor_and_long_gaps_begin_anew() -> None:
     poses[:3] = np.nan
     poses[60:170] = np.nan  # 5.5 s
     f = filter_trajectory(case.times, poses, case.covariance, case.sensor)
-    assert (f.frame_row < 0).nonzero()[0].tolist() == [0, 1, 2, *range(60, 170)]
+    assert (f.frame_row < 0).nonzero()[0].tolist() == [0, 1, 2, *range(160, 170)]  # bridged until it is too long
     nothing = filter_trajectory(case.times, np.full_like(poses, np.nan), case.covariance, case.sensor)
     assert len(nothing.timestamps_s) == 0
     assert consistency(nothing.nis) is None
@@ -219,73 +229,153 @@ def test_the_mounting_counts() -> None:
     assert told.mean > told.mean_high
 
 
+# ---- errors that neighbouring frames share
+
+
+def drifting(case: Case, seed: int, shared: Shared) -> np.ndarray:
+    """Poses whose errors are partly new in each frame, and partly walk on with the map: a place that was seen with an
+    error stays where it was put."""
+    rng = np.random.default_rng([seed, 77])
+    poses, drift = [], rigid3.IDENTITY
+    for pose, covariance in zip(case.truth, case.covariance, strict=True):
+        root = np.linalg.cholesky(covariance)
+        white, walk = (np.sqrt(share) * root @ rng.normal(size=6) for share in shared)
+        seen = rigid3.compose(pose, drift)
+        moved = perturbed(seen[None], walk[None])[0] if poses else seen
+        drift = rigid3.compose(rigid3.inverse(pose), moved)
+        poses.append(perturbed(moved[None], white[None])[0])
+    return np.array(poses)
+
+
+def with_shared(case: Case, poses: np.ndarray, shared: Shared) -> tuple[FilteredTrajectory, np.ndarray]:
+    """The filter told how errors are shared, and errors beyond those at its first row, 6 in the mean each."""
+    measured = read_measured(case.times, poses, case.covariance)
+    found, imu, n = InertialFilter(case.sensor, 10.0), case.sensor.imu, 0
+    for f, frame_s in enumerate(case.times):
+        while imu.timestamps_s[n] <= frame_s:
+            found.add_sample(float(imu.timestamps_s[n]), imu.gyro[n], imu.accel[n])
+            n += 1
+        found.add_frame(float(frame_s), measured.pose(f), shared)
+    result = found.result()
+    return result, case.nees(result, result.frame_row[40::40])
+
+
+def test_errors_that_walk_with_the_map_are_told_from_noise() -> None:
+    shared = Shared(0.1, 0.2)
+    told, nees, naive = [], [], []
+    for seed, case in enumerate(CASES):
+        poses = drifting(case, seed, shared)
+        found, errors = with_shared(case, poses, shared)
+        told.append(found.nis[3:])
+        nees.append(errors)
+        naive.append(with_shared(case, poses, INDEPENDENT)[1])
+    right, total = consistency(np.concatenate(told)), np.concatenate(nees)
+    assert right is not None
+    assert right.mean_low < right.mean < right.mean_high
+    low, high = chi2.ppf([0.025, 0.975], 6 * len(total)) / (6 * len(total))
+    assert low < total.mean() / 6 < high
+    # taken for noise that is new in every frame, they promise far too much
+    assert np.mean(naive) / 6 > 5.0
+
+
+def test_a_map_that_is_adjusted_is_no_motion() -> None:
+    case = CASES[1]
+    still = case.filtered(case.sensor)
+    moved = rigid3.from_matrix(rigid3.exp_so3(np.array([0.02, -0.05, 0.03])), np.array([0.3, -0.1, 0.2]))
+    poses = case.poses.copy()
+    poses[120:] = rigid3.compose(poses[120:], moved)
+    measured, imu, n = read_measured(case.times, poses, case.covariance), case.sensor.imu, 0
+    found = InertialFilter(case.sensor, unknown_rates(read_measured(case.times, case.poses, case.covariance))[0])
+    for f, frame_s in enumerate(case.times):
+        while imu.timestamps_s[n] <= frame_s:
+            found.add_sample(float(imu.timestamps_s[n]), imu.gyro[n], imu.accel[n])
+            n += 1
+        found.add_frame(float(frame_s), measured.pose(f), INDEPENDENT, moved if f == 120 else rigid3.IDENTITY)
+    np.testing.assert_allclose(found.result().nis, still.nis, rtol=1e-5)
+    np.testing.assert_allclose(found.result().cam_from_world, still.cam_from_world, atol=1e-7)
+    np.testing.assert_allclose(found.result().covariance, still.covariance, rtol=1e-4, atol=1e-10)
+
+
+def test_what_residuals_have_in_common() -> None:
+    rng = np.random.default_rng(5)
+    walk, memory, shares = rng.normal(size=(400, 2)), ResidualMemory(), SharedErrors()
+    step, white = 0.2, 0.3
+    for k in range(200):
+        walk = np.sqrt(1 - step) * walk + np.sqrt(step) * rng.normal(size=walk.shape)
+        residual = np.sqrt(1 - white) * walk + np.sqrt(white) * rng.normal(size=walk.shape)
+        shared = shares.add(snapshot(0.1 * k, rigid3.IDENTITY, np.eye(6), memory.look(np.arange(400), residual)))
+    # over one and two frames r = (1 - white) (1 - step)^(n / 2): the line through both
+    r1, r2 = ((1 - white) * (1 - step) ** (0.5 * n) for n in (1, 2))
+    assert shared.white == pytest.approx(1 - 2 * r1 + r2, abs=0.05)
+    assert shared.walk == pytest.approx(2 * (r1 - r2), abs=0.05)
+    # of points that only one of two frames sees, nothing is in common
+    half = ResidualMemory()
+    half.look(np.arange(400), walk)
+    assert half.look(np.arange(200, 600), np.roll(walk, -200, 0)).with_last == pytest.approx(0.5, abs=0.1)
+    half.forget()
+    assert np.isnan(half.look(np.arange(400), walk)).all()
+
+
 # ---- as a run has it
 
 
-def result_of(case: Case, inertial: ScaleEstimate | ScaleRefusal | None) -> OdometryResult:
-    num, none = len(case.times), np.zeros(0, np.int32)
-    tracks = make_tracks(0, 0, none, none, none, np.zeros((0, 2)))
-    entry = MapResult(Reconstruction.empty([], [], none, tracks), none, none, inertial=inertial)
-    return OdometryResult(
-        np.arange(num), [str(k) for k in range(num)], case.times, case.poses.copy(), case.poses.copy(),
-        np.zeros(num, np.int32), np.ones(num, np.uint8), [entry], measured_covariance=case.covariance,
+def snapshot(
+    time_s: float, pose: np.ndarray, covariance: np.ndarray, correlation: Correlation, map_idx: int = 0
+) -> FrameSnapshot:
+    return FrameSnapshot(
+        round(time_s * FPS), f"{time_s:.2f}", time_s, FrameState.TRACKED, np.zeros((1, 1), np.uint8),
+        np.zeros((0, 2), np.float32), np.zeros(0, bool), pose, covariance, correlation, rigid3.IDENTITY, map_idx, 0.0,
     )  # fmt: skip
 
 
-TURN, SHIFT, LATE_S = np.array([0.02, -0.01, 0.015]), np.array([0.03, -0.02, 0.01]), 0.03
+def lived(case: Case, imu: Imu | None, *, unit_m: float | None = None) -> tuple[FilteredTrajectory, FilterReport]:
+    """The frames of a case as a run gives them out, in a unit of their own if one is given."""
+    beside = LiveFilter(imu, is_metric=unit_m is None)
+    covariance = case.covariance.copy()
+    poses = case.poses.copy()
+    if unit_m is not None:
+        poses[:, 4:] /= unit_m
+        covariance = scale_covariance(covariance, 1.0 / unit_m)
+    for row in zip(case.times.tolist(), poses, covariance, strict=True):
+        beside.add(snapshot(*row, Correlation(0.0, 0.0)))
+    found = beside.finish(Events())
+    assert found is not None
+    return found
 
 
-def told(case: Case) -> InertialEvidence:
-    """What a closing adjustment says of a sensor with a wrong mounting and a late clock."""
-    return InertialEvidence(
-        num_poses=9, num_intervals=8, residual=1.0, gravity_in_map=DOWN.tolist(), gravity_sigma_deg=0.1,
-        gyro_bias=GYRO_BIAS.tolist(), accel_bias=ACCEL_BIAS.tolist(), clock_offset_s=LATE_S,
-        mounting_turn_deg=np.degrees(TURN).tolist(), mounting_shift_m=SHIFT.tolist(),
-    )  # fmt: skip
+@pytest.mark.parametrize("unit_m", [None, 2.0])
+def test_a_run_finds_gravity_scale_and_clock_by_itself(unit_m: float | None) -> None:
+    for case in CASES[:3]:
+        late = replace(case.sensor.imu, timestamps_s=case.sensor.imu.timestamps_s + LATE_S)
+        found, report = lived(case, late, unit_m=unit_m)
+        assert (report.prediction, report.reason, report.rejected) == ("imu", None, [])
+        assert found.timestamps_s[0] == pytest.approx(SHORTEST_S, abs=2.0)
+        assert report.rate_hz == pytest.approx(RATE_HZ, rel=0.01)
+        assert report.white_share == 1.0
+        assert report.consistency is not None
+        assert 0.8 < report.consistency.mean < report.consistency.mean_high + 0.1
+        ways = [np.linalg.norm(np.diff(rigid3.center(poses), axis=0), axis=1).sum() for poses in (
+            found.cam_from_world[found.frame_row[-100:]], case.truth[-100:])]  # fmt: skip
+        assert ways[0] == pytest.approx(ways[1], rel=0.02)
+        lines = filtered_csv(found).splitlines()
+        assert lines[0] == ",".join(COLUMNS)
+        assert len(lines) == len(found.timestamps_s) + 1
 
 
-def test_clock_and_mounting_are_those_of_the_closing_adjustment() -> None:
-    case = CASES[5]
-    # given such that with TURN and SHIFT, as the adjustment means them, it is the true one
-    cam_from_imu = rigid3.inverse(IMU_FROM_CAM)
-    back = rigid3.rotation_matrix(cam_from_imu) @ rigid3.exp_so3(TURN).T
-    given = rigid3.inverse(rigid3.from_matrix(back, cam_from_imu[4:] - SHIFT))
-    place = Placement(given, np.eye(3))
-    world_from_cam = rigid3.inverse(case.truth[7])
-    pose = place.sensor(gtsam_pose(case.truth[7]), np.zeros(3), np.zeros(4), np.r_[TURN, SHIFT], np.zeros(3))
-    assert np.allclose(pose.translation(), rigid3.compose(world_from_cam, cam_from_imu)[4:])
-    assert np.allclose(pose.rotation().matrix(), rigid3.rotation_matrix(rigid3.compose(world_from_cam, cam_from_imu)))
-    imu = replace(case.sensor.imu, imu_from_cam=given, timestamps_s=case.sensor.imu.timestamps_s + LATE_S)
-    result = result_of(case, ScaleEstimate(1.0, 0.001, "imu", told(case)))
-    report = filter_largest_map(result, imu, case.times + 1e9, Events())
-    assert (report.prediction, report.reason, report.rejected, report.gaps) == ("imu", None, [], [])
-    assert report.num_used == len(case.times)
-    assert report.consistency is not None
-    # biases and gravity are better known than the filter takes them to be, so it is a little low to begin with
-    assert 0.8 < report.consistency.mean < report.consistency.mean_high
-    filtered = result.filtered
-    assert filtered is not None
-    assert np.allclose(filtered.timestamps_s[filtered.frame_row], case.times + 1e9)
-    lines = filtered_csv(filtered).splitlines()
-    assert lines[0] == ",".join(COLUMNS)
-    assert len(lines) == len(filtered.timestamps_s) + 1
-
-
-def test_a_sensor_that_had_no_part_in_the_map_does_not_predict() -> None:
-    case = CASES[6]
-    refused = ScaleRefusal("imu", "the motion is too even", told(case))
-    for inertial, reason in ((refused, "too even"), (None, "without the inertial")):
-        result = result_of(case, inertial)
-        result.cam_from_world[100:120] = np.nan
-        result.cam_from_world[150:151] = perturbed(case.poses[150:151], np.array([[0, 0, 0, 3.0, 0, 0]]))
-        report = filter_largest_map(result, case.sensor.imu, case.times, Events())
-        assert report.prediction == "constant velocity"
-        assert report.reason is not None
-        assert reason in report.reason
-        assert [row.name for row in report.rejected] == ["150"]
+def test_a_sensor_that_tells_nothing_does_not_predict() -> None:
+    case = Case(6)
+    case.poses[100:120] = np.nan
+    case.poses[150:151] = perturbed(case.poses[150:151], np.array([[0, 0, 0, 3.0, 0, 0]]))
+    still = replace(case.sensor.imu, gyro=np.roll(case.sensor.imu.gyro, 1, 1))
+    for imu, reason in ((still, "the gyroscope contradicts the rotations"), (None, None)):
+        found, report = lived(case, imu)
+        assert report.prediction == found.prediction == "constant velocity"
+        assert (report.reason or "").startswith(reason or "")
+        assert (report.reason is None) == (reason is None)
+        assert [row.name for row in report.rejected] == [f"{case.times[150]:.2f}"]
         assert [(gap.first_s, gap.last_s) for gap in report.gaps] == [
             (pytest.approx(case.times[99]), pytest.approx(case.times[119])),
             (pytest.approx(case.times[149]), pytest.approx(case.times[150])),
         ]
         assert report.gaps[0].position_sigma > 3 * report.gaps[1].position_sigma
-    assert filter_largest_map(result_of(case, None), None, case.times, Events()).reason is None
+    assert LiveFilter(None, is_metric=True).finish(Events()) is None

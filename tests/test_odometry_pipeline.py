@@ -7,7 +7,6 @@ import json
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.records import _covariance_gap
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
 from sfmapp.odometry.report import InertialEvidence
-from sfmapp.odometry.result import FrameState, OdometryResult
+from sfmapp.odometry.result import FrameState
 from sfmapp.pipelines.odometry import track as pipeline
 from sfmapp.pipelines.odometry.scale import parse_scale
 from sfmapp.pipelines.odometry.timing import ThreadTimes
@@ -332,17 +331,9 @@ def test_workspaces_of_other_commands_are_refused(
 # ------------------------------------------------------------------------------------------------------------- filter
 
 
-def test_a_filtered_trajectory_bridges_the_gap_and_is_scaled(tmp_path: Path, monkeypatch: Patch) -> None:
-    runner = FakeRunner(lost=range(20, 25))
-
-    def with_covariances(*args: Any, **kwargs: Any) -> OdometryResult:
-        result = runner(*args, **kwargs)
-        result.measured_covariance = np.tile(np.diag([1e-3] * 3 + [0.01] * 3) ** 2, (len(result.frame_idx), 1, 1))
-        return result
-
-    use(monkeypatch, FakeSequence(), with_covariances)
-    length = float(np.linalg.norm(np.diff(rigid3.center(path(50))[[0, 40]], axis=0)))
-    report = run(tmp_path / "out", "odometry.filter=true", f"scale.source=distance:0:40:{length:.4f}").report
+def test_live_poses_are_filtered_and_the_gap_bridged(tmp_path: Path, monkeypatch: Patch) -> None:
+    use(monkeypatch, FakeSequence(), FakeRunner(lost=range(20, 25)))
+    report = run(tmp_path / "out", "odometry.filter=true").report
     check_schema("odometry", json.loads((tmp_path / "out" / "report.json").read_text()))
     told = report["stages"]["filter"]
     assert (told["prediction"], told["num_used"], told["rejected"]) == ("constant velocity", 45, [])
@@ -352,14 +343,16 @@ def test_a_filtered_trajectory_bridges_the_gap_and_is_scaled(tmp_path: Path, mon
     rows = rows_of(tmp_path / "out" / "trajectory_filtered.csv")
     assert [float(row["timestamp_s"]) for row in rows] == [float(time) for time in times]
     assert [int(row["is_bridged"]) for row in rows] == [0] * 20 + [1] * 5 + [0] * 25
-    # a centimetre of noise in a unit of two metres, and so are the sigmas
+    # a centimetre of noise, in the unit of the map, and so are the sigmas
     sigma = np.array([float(row["position_sigma"]) for row in rows])
-    assert sigma[30:].max() < 0.02 * np.sqrt(3) + 1e-6
+    assert sigma[30:].max() < 0.01 * np.sqrt(3) + 1e-6
     assert sigma[24] > 2 * sigma[30]
     found = Trajectory.from_cam_from_world(poses, np.array([float(time) for time in times]))
     truth = Trajectory.from_cam_from_world(path(50), np.arange(50) / FPS + float(times[0]))
     # the path bends and the prediction does not, as the sigma knows
-    assert (absolute_error(associate(found, truth), "se3").translation_m < 3 * sigma).all()
+    error = absolute_error(associate(found, truth), "sim3")
+    assert error.scale == pytest.approx(2.0, rel=0.01)  # live poses have the unit of their time
+    assert (error.translation_m < 3 * 2.0 * sigma).all()
     # another run takes them away
     run(tmp_path / "out")
     assert not list((tmp_path / "out").glob("trajectory_filtered*"))

@@ -14,7 +14,7 @@ from sfmapp.api.images import load_images
 from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.api.stages import extract_features, map_images, match_images
 from sfmapp.errors import UsageError
-from sfmapp.events import Event, Events
+from sfmapp.events import Event, Events, Listener
 from sfmapp.images.load import Images
 from sfmapp.workspace.options import Options
 
@@ -544,14 +544,15 @@ def _told_of_frames(events: Events, on_frame: Callable[[FrameSnapshot], None] | 
 def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
-    from sfmapp.pipelines.odometry.filtering import filter_largest_map
+    from sfmapp.pipelines.odometry.filtering import LiveFilter
     from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 
     if isinstance(source, str | os.PathLike):
         raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
     wanted = options.scale.source
     request = resolve_scale_request(None if wanted is None else parse_scale(wanted), wanted is None, source)
-    with one_blas_thread():
+    beside = LiveFilter(source.imu, is_metric=source.rig.is_stereo) if options.odometry.filter else None
+    with one_blas_thread(), _listening(events, beside):
         found = run_odometry(
             source, options.odometry, seed=options.seed, threads=options.num_workers, events=events,
             markers=None if request is None else request.detector(), with_imu=takes_imu(request, wanted is None),
@@ -560,9 +561,20 @@ def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Ev
         scale_maps(found, request, events)
     if not found.maps:
         raise NoReconstructionError(f"{len(found.frame_idx)} frames were given, but no map could be initialized")
-    if options.odometry.filter:
-        filter_largest_map(found, source.imu, found.timestamps_s, events)
+    if beside is not None and (filtered := beside.finish(events)) is not None:
+        found.filtered = filtered[0]
     return _with_views(found)
+
+
+@contextmanager
+def _listening(events: Events, listener: Listener | None) -> Iterator[None]:
+    if listener is not None:
+        events.subscribe(listener)
+    try:
+        yield
+    finally:
+        if listener is not None:
+            events.unsubscribe(listener)
 
 
 def _with_views(found: OdometryResult) -> OdometryResult:

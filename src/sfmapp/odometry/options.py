@@ -43,8 +43,8 @@ class OdometryOptions:
         loops: recognise places seen before, close loops and join maps
         refine_camera: refine the calibration where the images clearly contradict it
         smooth: also write the trajectory smoothed by an error-state filter: steadier, with short gaps bridged
-        filter: also write the trajectory as an error-state filter has it that knows the past alone, predicted with the
-            IMU, at its rate, or by constant velocity, with sigmas, gaps of up to five seconds bridged
+        filter: also write live poses as an error-state filter has them, predicted with the IMU, at its rate and in
+            metres, or by constant velocity, with sigmas, gaps of up to five seconds bridged
         covariance: estimate covariances of the keyframes after the final adjustment
     """
 

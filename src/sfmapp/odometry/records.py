@@ -13,6 +13,7 @@ from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.options import MAX_COVARIANCE_KEYFRAMES
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment
+from sfmapp.odometry.residual_memory import NOT_KNOWN, Correlation
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.odometry.tracker import measure_pose
 
@@ -29,7 +30,8 @@ class FrameRecord:
         map_idx: number of the map in the order of their beginnings, -1 without one.
         keyframe: position in the map's keyframes. frame_from_keyframe: (7,), NaN without a pose.
         is_keyframe: it is that keyframe.
-        live: (7,) cam_from_world as it was given out.
+        live: (7,) cam_from_world as it was given out. live_covariance: (6, 6) of it given the map at that time, as of
+            ``refine_pose``; NaN where it was not measured. correlation: of its residuals with those of frames before.
         covariance: (6, 6) of the pose given the map, as of ``refine_pose``; NaN where it was not measured.
         point_id: (N,) int32 and xy: (N, 2) float32, the points that its pose was measured with.
         cpu_s: CPU seconds of tracking, without the back end.
@@ -44,6 +46,8 @@ class FrameRecord:
     is_keyframe: bool = False
     frame_from_keyframe: Array = field(default_factory=_NO_POSE.copy)
     live: Array = field(default_factory=_NO_POSE.copy)
+    live_covariance: Array = field(default_factory=_NO_COVARIANCE.copy)
+    correlation: Correlation = NOT_KNOWN
     covariance: Array = field(default_factory=_NO_COVARIANCE.copy)
     point_id: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     xy: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))

@@ -206,7 +206,7 @@ class FilterGap(Report):
 
 
 class FilterReport(Report):
-    """What the error-state filter made of the largest map.
+    """What the error-state filter made of the live poses of the map with the most of them.
 
     Attributes:
         prediction: ``imu`` or ``constant velocity``; reason: why not by the sensor, where there is one.
@@ -216,6 +216,8 @@ class FilterReport(Report):
         consistency: absent where nothing could be compared.
         latency_ms_median, latency_ms_p95, latency_ms_max: from a sample or a pose to the filtered pose, the tracking of
             the frame left out.
+        white_share, walk_share: of the variance of a pose, in the middle: what is new in each frame and gone in the
+            next, and what is added from frame to frame and stays with the map.
     """
 
     prediction: str
@@ -227,6 +229,8 @@ class FilterReport(Report):
     latency_ms_median: float
     latency_ms_p95: float
     latency_ms_max: float
+    white_share: float
+    walk_share: float
     reason: str | None = None
     consistency: FilterConsistency | None = None
 

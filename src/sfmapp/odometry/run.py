@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.camera.camera import project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
@@ -35,6 +36,7 @@ from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.report import OdometryReport, ShutterReport
+from sfmapp.odometry.residual_memory import ResidualMemory
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -59,6 +61,7 @@ class _Tracked:
         previous: pyramid of the last frame; None before the first.
         num_mapped_at_keyframe: how many were mapped when the newest keyframe was made.
         covariance: (6, 6) of the pose given the map; not finite where it was not measured.
+        map_moved: (7,) see :class:`~sfmapp.odometry.snapshot.FrameSnapshot`, since the last frame was told of.
     """
 
     pose: Array = field(default_factory=rigid3.IDENTITY.copy)
@@ -67,6 +70,7 @@ class _Tracked:
     previous: Pyramid | None = None
     num_mapped_at_keyframe: int = 0
     covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    map_moved: Array = field(default_factory=rigid3.IDENTITY.copy)
 
     def drop_tracks(self) -> None:
         """Nothing is followed any more."""
@@ -118,6 +122,7 @@ class Odometry:
         self.local: LocalMap | None = None  # the map that the camera is in, or was in when it was lost
         self.recognition, self.keyframe_images = Recognition(seed, self.executor), KeyframeImages(markers)
         self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
+        self.residuals = ResidualMemory()
         self.clock = StereoClock(self.rig)
         self.known = None if known is None else self._enter_known_map(known)
         self._begin_to_wait()
@@ -153,12 +158,14 @@ class Odometry:
         record.cpu_s = time.thread_time() - start
         if record.is_keyframe:
             self.keyframe_images.look(frame.idx, frame.images[0])
+        latency_s = math.nan if frame.captured_s is None else time.monotonic() - frame.captured_s
         snapshot = FrameSnapshot(
             frame.idx, frame.name, frame.shown_s, record.state, frame.images[0],
-            self.tracked.tracks.xy.astype(np.float32), self.tracked.is_mapped, record.live, record.map_idx,
-            record.cpu_s, math.nan if frame.captured_s is None else time.monotonic() - frame.captured_s,
+            self.tracked.tracks.xy.astype(np.float32), self.tracked.is_mapped, record.live, record.live_covariance,
+            record.correlation, self.tracked.map_moved, record.map_idx, record.cpu_s, latency_s,
             None if belief is None or belief.num_looks == num_looks else belief.state(),
         )  # fmt: skip
+        self.tracked.map_moved = rigid3.IDENTITY
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
         return record
 
@@ -267,7 +274,10 @@ class Odometry:
             return False
         self.motion.learn(rigid3.compose(found.pose, rigid3.inverse(tracked.pose)))
         tracked.pose, tracked.tracks, tracked.is_mapped = found.pose, found.tracks, found.is_mapped
-        tracked.covariance = found.covariance
+        tracked.covariance = record.live_covariance = found.covariance
+        point_id, xy = found.tracks.point_id[found.is_mapped], found.tracks.xy[found.is_mapped]
+        seen = project(local.camera, rigid3.apply(found.pose, local.keyframes.point_xyz[point_id]))
+        record.correlation = self.residuals.look(point_id, xy - seen)
         local.witnesses.followed(view.frame_idx, found.num_followed, len(found.tracks))
         reason = keyframe_reason(local, found, tracked.num_mapped_at_keyframe, self.options)
         if reason is None:
@@ -325,6 +335,7 @@ class Odometry:
         if local.backend.finish(local.keyframes, number):
             moved = rigid3.compose(rigid3.inverse(before), local.pose(local.newest))
             self.tracked.pose = rigid3.compose(self.tracked.pose, moved)
+            self.tracked.map_moved = rigid3.compose(self.tracked.map_moved, moved)
 
     def _count_mapped(self) -> None:
         assert self.local is not None
@@ -334,6 +345,7 @@ class Odometry:
     # ------------------------------------------------------------------ loss
 
     def _lose(self, record: FrameRecord) -> None:
+        self.residuals.forget()
         self.state.lose(record.timestamp_s)
         self.counts.losses += 1
         self.motion.stop()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.odometry.residual_memory import Correlation
 from sfmapp.odometry.result import FrameState
 
 Array = NDArray[np.float64]
@@ -45,6 +46,11 @@ class FrameSnapshot:
         image: (H, W) uint8, the rig's first camera.
         xy: (N, 2) float32 tracked points, pixels. is_mapped: (N,) bool, those that the pose was measured with.
         cam_from_world: (7,) pose as it was given out, NaN without one.
+        covariance: (6, 6) of the pose given the map, over rotation (radians) and translation of
+            ``x_cam <- exp(w) x_cam + v``; NaN where it was not measured.
+        map_moved: (7,) how adjustments have moved the map below the camera since the frame before: a place x of now was
+            at map_moved(x).
+        correlation: how far the frame's residuals are those of the frames before it.
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
         cpu_s: CPU seconds of tracking, back end not included.
         latency_s: of a live source, seconds from when the frame came until its pose was known; NaN of recorded ones.
@@ -59,6 +65,9 @@ class FrameSnapshot:
     xy: NDArray[np.float32]
     is_mapped: NDArray[np.bool_]
     cam_from_world: Array
+    covariance: Array
+    correlation: Correlation
+    map_moved: Array
     map_idx: int
     cpu_s: float
     latency_s: float = math.nan

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # No inertial sensor is slower than 10 Hz: a longer silence is a gap.
-_MAX_SILENCE_S = 0.1
+MAX_SILENCE_S = 0.1
 
 
 def imu_rotation(imu: Imu, start_s: float, stop_s: float, gyro_bias: ArrayLike = (0.0, 0.0, 0.0)) -> Array | None:
@@ -91,7 +91,7 @@ def imu_steps(imu: Imu, start_s: float, stop_s: float) -> Array | None:
     index = np.clip(np.arange(low - 1, high + 1), 0, len(times) - 1)
     nodes = np.concatenate([[start_s], times[low:high], [stop_s]])
     silence = np.diff(times[index]).max(initial=0.0)
-    if silence > _MAX_SILENCE_S or times[0] - start_s > _MAX_SILENCE_S or stop_s - times[-1] > _MAX_SILENCE_S:
+    if silence > MAX_SILENCE_S or times[0] - start_s > MAX_SILENCE_S or stop_s - times[-1] > MAX_SILENCE_S:
         return None
     local = times[index[0] : index[-1] + 1]
     values = np.concatenate([imu.gyro[index[0] : index[-1] + 1], imu.accel[index[0] : index[-1] + 1]], 1)

@@ -127,6 +127,10 @@ class MeasuredPoses(NamedTuple):
     noise: Array
     is_there: Bools
 
+    def pose(self, row: int) -> tuple[Array, Array, Array] | None:
+        """Position, rotation and noise of a frame; None in a gap."""
+        return (self.position[row], self.rotation[row], self.noise[row]) if self.is_there[row] else None
+
     def part(self, rows: slice) -> MeasuredPoses:
         return MeasuredPoses(
             self.times[rows], self.position[rows], self.rotation[rows], self.noise[rows], self.is_there[rows]

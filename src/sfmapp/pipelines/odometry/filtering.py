@@ -1,54 +1,188 @@
-"""The largest map's trajectory as an error-state filter has it, and what that says of itself."""
+"""The error-state filter beside an odometry run: fed with live poses and samples as they come, and what it says."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.events import Events
-from sfmapp.geometry import rigid3
+from sfmapp.events import Event, Events
 from sfmapp.images.sequence import Imu
 from sfmapp.odometry.inertial.filtering import (
     LIVE,
     FilteredTrajectory,
-    InertialSensor,
+    InertialFilter,
+    Shared,
     consistency,
     filter_trajectory,
 )
-from sfmapp.odometry.inertial.scale import ScaleRefusal
-from sfmapp.odometry.report import FilterGap, FilterReport, InertialEvidence, RejectedPose
-from sfmapp.odometry.result import MapResult, OdometryResult
+from sfmapp.odometry.inertial.live_start import LONGEST_S, SHORTEST_S, STEP_S, in_metres, start_of, until
+from sfmapp.odometry.inertial.scale import scale_covariance
+from sfmapp.odometry.inertial.smoothing import read_measured
+from sfmapp.odometry.report import FilterGap, FilterReport, RejectedPose
+from sfmapp.odometry.snapshot import FrameSnapshot
 
 Array = NDArray[np.float64]
 
 STAGE = "filter"
 COLUMNS = ("timestamp_s", "position_sigma", "rotation_sigma_deg", "since_pose_s", "is_bridged", "latency_ms")
+# Of what neighbouring residuals have in common the last second of frames tells, each the less the older it is.
+_FORGET = 0.95
+# What is new in every frame is at least the noise of its own pixels, a small part of all.
+_LEAST_WHITE = 0.02
+# Of a velocity of which nothing is known, m/s: whatever carries a camera.
+_UNKNOWN_SPEED = 10.0
 
 
-def filter_largest_map(result: OdometryResult, imu: Imu | None, given_s: Array, events: Events) -> FilterReport:
-    """Filter the final poses of the largest map, with their covariances given the map, and put that into the result.
+class SharedErrors:
+    """How live poses err together, by what the residuals of neighbouring frames have in common.
+
+    With correlations r1 over one frame and r2 over two, errors that partly are new in each frame and partly walk on
+    with the map have 1 - r = white + walk n / 2 over n frames.
+    """
+
+    def __init__(self) -> None:
+        self._sums, self._weight = np.zeros(2), 0.0
+
+    def add(self, frame: FrameSnapshot) -> Shared:
+        """Learn from a frame; what is known by then."""
+        found = np.array(frame.correlation)
+        if np.isfinite(found).all():
+            self._sums, self._weight = _FORGET * self._sums + found, _FORGET * self._weight + 1.0
+        if self._weight == 0.0:
+            return Shared(1.0, 0.0)
+        r1, r2 = (self._sums / self._weight).tolist()
+        white = min(1.0, max(_LEAST_WHITE, 1.0 - 2.0 * r1 + r2))
+        return Shared(white, 2.0 * max(0.0, min(r1 - r2, 1.0 - r1)))
+
+
+@dataclass
+class _MapFilter:
+    """What is filtered in one live map.
+
+    Attributes:
+        names: of its frames, with and without a pose; times_s and poses beside them.
+        scale: metres per unit of the live poses, by the sensor.
+        reason: why the sensor does not predict yet.
+    """
+
+    names: list[str] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    shares: list[Shared] = field(default_factory=list)
+    first: int = 0
+    inertial: InertialFilter | None = None
+    scale: float = 1.0
+    next_sample: int = 0
+    clock_offset_s: float = 0.0
+    tried_s: float = -np.inf
+    reason: str = ""
+
+
+class LiveFilter:
+    """Listener of a run that filters its live poses, each map apart.
+
+    With a sensor each row is found as its sample comes. Without one the poses wait for the end, as the level of the
+    accelerations is that of all; each row still knows only of what came before it.
 
     Args:
-        imu: None without one; on the clock of the result.
-        given_s: (F,) the times of the frames on the sequence's own clock, on which those of the poses will be.
+        imu: on the clock of the frames; None without one.
+        is_metric: live poses are in metres.
     """
-    assert result.measured_covariance is not None
-    sensor = "" if imu is None else _sensor(result.maps[0], imu)
-    poses = np.where((result.frame_map == 0)[:, None], result.cam_from_world, np.nan)
-    found = filter_trajectory(
-        result.timestamps_s, poses, result.measured_covariance, sensor if isinstance(sensor, InertialSensor) else None
-    )
-    found = replace(found, timestamps_s=np.interp(found.timestamps_s, result.timestamps_s, given_s))
-    result.filtered = found
-    report = _report(result, found, given_s, sensor if isinstance(sensor, str) and sensor else None)
-    events.decided(STAGE, _told(report), **report)
-    return report
+
+    def __init__(self, imu: Imu | None, *, is_metric: bool) -> None:
+        self._imu, self._is_metric = imu, is_metric
+        self._maps: dict[int, _MapFilter] = {}
+        self._current = -1
+        self._shared = SharedErrors()
+
+    def __call__(self, event: Event) -> None:
+        seen = event.data.get("snapshot")
+        if isinstance(seen, FrameSnapshot):
+            self.add(seen)
+
+    def add(self, frame: FrameSnapshot) -> None:
+        """Take a frame along as it was given out."""
+        shared, has_pose = self._shared.add(frame), bool(np.isfinite(frame.cam_from_world[0]))
+        if has_pose and frame.map_idx != self._current:
+            self._current = frame.map_idx
+            # one that is found again is in the frame that it had, and knows what it knew
+            self._maps.setdefault(self._current, _MapFilter())
+        if self._current < 0:
+            return
+        now = self._maps[self._current]
+        now.names.append(frame.name)
+        now.times_s.append(frame.timestamp_s)
+        now.poses.append(frame.cam_from_world)
+        now.covariances.append(frame.covariance)
+        now.shares.append(shared)
+        if self._imu is not None and (now.inertial is not None or (has_pose and self._begins(now, self._imu))):
+            moved = in_metres(frame.map_moved, now.scale)
+            self._go_on(now, self._imu, shared, moved)
+
+    def _begins(self, now: _MapFilter, imu: Imu) -> bool:
+        """Look for a start in the last seconds, once in a while."""
+        times = np.array(now.times_s)
+        if times[-1] - times[0] < SHORTEST_S or times[-1] - now.tried_s < STEP_S:
+            return False
+        now.tried_s = float(times[-1])
+        recent = times >= times[-1] - LONGEST_S
+        poses = np.array(now.poses)[recent]
+        found = start_of(times[recent], poses, until(imu, now.tried_s), is_metric=self._is_metric)
+        if isinstance(found, str):
+            now.reason = found
+            return False
+        now.inertial = InertialFilter(found.sensor, _UNKNOWN_SPEED)
+        now.scale, now.clock_offset_s, now.reason = found.scale, found.clock_offset_s, ""
+        now.first = len(times) - 1
+        # the last samples before the frame tell the first after it
+        after = int(np.searchsorted(imu.timestamps_s - now.clock_offset_s, now.tried_s, "right"))
+        now.next_sample = max(0, after - 2)
+        return True
+
+    def _go_on(self, now: _MapFilter, imu: Imu, shared: Shared, map_moved: Array) -> None:
+        """The samples until a frame, and the frame."""
+        assert now.inertial is not None
+        frame_s, times = now.times_s[-1], imu.timestamps_s
+        while now.next_sample < len(times) and times[now.next_sample] - now.clock_offset_s <= frame_s:
+            n = now.next_sample
+            now.inertial.add_sample(float(times[n] - now.clock_offset_s), imu.gyro[n], imu.accel[n])
+            now.next_sample += 1
+        measured = read_measured(
+            [frame_s], in_metres(now.poses[-1][None], now.scale), scale_covariance(now.covariances[-1], now.scale)[None]
+        )
+        now.inertial.add_frame(frame_s, measured.pose(0), shared, map_moved)
+
+    def finish(self, events: Events) -> tuple[FilteredTrajectory, FilterReport] | None:
+        """What was found of the map with the most poses, and what there is to say of it; None without a frame."""
+        if not self._maps:
+            return None
+        most = max(self._maps.values(), key=lambda entry: int(np.isfinite(np.array(entry.poses)[:, 0]).sum()))
+        if most.inertial is not None:
+            found = most.inertial.result()
+        else:
+            found = _at_constant_velocity(most)
+        names = most.names[most.first :]
+        shares = np.array(most.shares)[most.first :]
+        reason = (most.reason or "the map was too short") if self._imu is not None and most.inertial is None else None
+        report = _report(found, names, most.times_s[most.first :], shares, reason)
+        events.decided(STAGE, _told(report), **report)
+        return found, report
+
+
+def _at_constant_velocity(entry: _MapFilter) -> FilteredTrajectory:
+    """The same by the poses alone. What walks with the map is motion to this filter; what frames share is added to what
+    it says of itself."""
+    covariances, white = np.array(entry.covariances), np.array([share.white for share in entry.shares])[:, None, None]
+    found = filter_trajectory(entry.times_s, np.array(entry.poses), white * covariances)
+    common = np.where(np.isfinite(covariances), (1.0 - white) * covariances, 0.0)
+    rows = np.flatnonzero(found.frame_row >= 0)
+    return replace(found, covariance=found.covariance + common[rows])
 
 
 def filtered_csv(found: FilteredTrajectory) -> str:
@@ -65,50 +199,27 @@ def filtered_csv(found: FilteredTrajectory) -> str:
     return text.getvalue()
 
 
-def _sensor(entry: MapResult, imu: Imu) -> InertialSensor | str:
-    """The sensor as the closing adjustment has found it, or why it cannot predict."""
-    if entry.inertial is None:
-        return "the map was made without the inertial measurements"
-    if isinstance(entry.inertial, ScaleRefusal):
-        return entry.inertial.reason
-    told = entry.inertial.evidence
-    assert isinstance(told, InertialEvidence)
-    if told.gravity_in_map is None or told.gravity_sigma_deg is None:
-        return "the motion leaves open where down is"
-    cam_from_imu = rigid3.inverse(imu.imu_from_cam)
-    turn = np.radians(told.mounting_turn_deg if told.mounting_turn_deg is not None else np.zeros(3))
-    shift = np.asarray(told.mounting_shift_m if told.mounting_shift_m is not None else np.zeros(3))
-    mounted = rigid3.from_matrix(rigid3.rotation_matrix(cam_from_imu) @ rigid3.exp_so3(turn), cam_from_imu[4:] + shift)
-    # what the adjustment has found the sensor to be noisier by
-    excess = math.sqrt(max(1.0, told.residual or 1.0))
-    imu = replace(
-        imu, timestamps_s=imu.timestamps_s - (told.clock_offset_s or 0.0), imu_from_cam=rigid3.inverse(mounted),
-        gyro_noise=excess * imu.gyro_noise, accel_noise=excess * imu.accel_noise,
-        gyro_walk=excess * imu.gyro_walk, accel_walk=excess * imu.accel_walk,
-    )  # fmt: skip
-    gyro_bias, accel_bias = (np.zeros(3) if b is None else np.asarray(b) for b in (told.gyro_bias, told.accel_bias))
-    return InertialSensor(
-        imu, np.asarray(told.gravity_in_map), float(np.radians(told.gravity_sigma_deg)), gyro_bias, accel_bias
-    )
-
-
-def _report(result: OdometryResult, found: FilteredTrajectory, given_s: Array, reason: str | None) -> FilterReport:
+def _report(
+    found: FilteredTrajectory, names: list[str], times_s: list[float], shares: Array, reason: str | None
+) -> FilterReport:
     latency = 1e3 * found.latency_s if len(found.latency_s) else np.zeros(1)
     rate = 1.0 / float(np.median(np.diff(found.timestamps_s))) if len(found.timestamps_s) > 1 else 0.0
     rejected = [
         RejectedPose(
-            name=result.frame_names[f], timestamp_s=float(given_s[f]),
+            name=names[f], timestamp_s=times_s[f],
             reason=f"the motion contradicts it: NIS {found.nis[f]:.0f} of 6 degrees of freedom, at most "
             f"{LIVE.max_nis:g} is believed",
         )
         for f in np.flatnonzero(found.is_rejected)
     ]  # fmt: skip
     rows = found.frame_row[found.frame_row >= 0]
+    white, walk = np.median(shares, axis=0).tolist() if len(shares) else (1.0, 0.0)
     return FilterReport(
         prediction=found.prediction, num_poses=len(found.timestamps_s), rate_hz=round(rate, 3),
         num_used=int((found.since_pose_s[rows] == 0.0).sum()), rejected=rejected, gaps=list(_gaps(found)),
         latency_ms_median=float(np.median(latency)), latency_ms_p95=float(np.percentile(latency, 95)),
-        latency_ms_max=float(latency.max()), reason=reason, consistency=consistency(found.nis),
+        latency_ms_max=float(latency.max()), white_share=white, walk_share=walk, reason=reason,
+        consistency=consistency(found.nis),
     )  # fmt: skip
 
 
@@ -125,8 +236,9 @@ def _gaps(found: FilteredTrajectory) -> Iterator[FilterGap]:
 
 def _told(report: FilterReport) -> str:
     text = (
-        f"filtered by {report.prediction.replace('imu', 'the IMU')}: {report.num_poses} poses at {report.rate_hz:.4g} "
-        f"Hz, {report.num_used} measured ones used, {len(report.rejected)} rejected, {len(report.gaps)} gaps bridged"
+        f"filtered live by {report.prediction.replace('imu', 'the IMU')}: {report.num_poses} poses at "
+        f"{report.rate_hz:.4g} Hz, {report.num_used} measured ones used, {len(report.rejected)} rejected, "
+        f"{len(report.gaps)} gaps bridged"
     )
     if report.consistency is not None:
         told = report.consistency

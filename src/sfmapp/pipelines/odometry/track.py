@@ -21,7 +21,7 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.filtering import filter_largest_map
+from sfmapp.pipelines.odometry.filtering import LiveFilter
 from sfmapp.pipelines.odometry.known_map import read_known_map
 from sfmapp.pipelines.odometry.live import live_counts
 from sfmapp.pipelines.odometry.results import write_odometry
@@ -140,6 +140,10 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
         compiled = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
         run.stages = replace(run.stages, kernels=compiled)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
+    beside = None
+    if options.odometry.filter:
+        beside = LiveFilter(run.sequence.imu, is_metric=run.sequence.rig.is_stereo)
+        run.listen(beside)
     with run.measured("odometry"):
         result = run_odometry(
             watched,
@@ -163,10 +167,9 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
             scaled = scale_maps(result, run.scale_request, without_cancellation)
             run.stages = replace(run.stages, scale=scaled)
     given_s = watched.times_as_given(result)
-    if options.odometry.filter and result.maps:
-        with run.measured("filter"):
-            filtered = filter_largest_map(result, watched.imu, given_s, events.without_cancellation())
-            run.stages = replace(run.stages, filter=filtered)
+    if beside is not None and result.maps and (filtered := beside.finish(events.without_cancellation())) is not None:
+        result.filtered = filtered[0]
+        run.stages = replace(run.stages, filter=filtered[1])
     result = replace(result, timestamps_s=given_s)
     if isinstance(run.sequence, FileSequence | VideoSequence):  # frames in memory are all there
         result = result.with_repeated(run.sequence.repeated)
