@@ -384,6 +384,22 @@ def test_black_and_mirroring_surfaces_are_left_alone_and_named() -> None:
     assert all(report.mirror_share > 0.0 for report in reports)
 
 
+def test_dead_pixels_are_no_shadows() -> None:
+    _, views, _, hull, _ = scene("ball")
+    rig, lit = around(16, 4, width=160), np.full((120, 160), 130, np.uint8)
+    dead = lit.copy()
+    dead[50, 70] = dead[60:62, 80] = 0
+    shaded = dead.copy()
+    shaded[70:80, 60:90] = 2
+    inside = np.ones(lit.shape, np.bool_)
+    photographs = [LitPhotograph(lit, [dead, shaded], inside, views[0], rig.lamps[0][:2], hull)]
+    fans, _, _ = find_shadows(photographs, ["dead", "shaded"], fan_deg=2.0, edge_deg=75.0)
+    assert not np.isfinite(fans[0][0]).any()
+    # to the pixel, and black enough for a narrow fan
+    assert np.array_equal(np.isfinite(fans[0][1]), shaded == 2)
+    assert (fans[0][1][shaded == 2] < 1.0).all()
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Every other photograph of the block with alpha and cameras, and under each lamp alone."""

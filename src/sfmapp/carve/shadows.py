@@ -48,6 +48,8 @@ _NOTEWORTHY = 0.05
 _FULL = 252
 # pixels about a mirrored light where its image may still outshine the surface, in its radii, and at least
 _HALO, _LEAST_HALO_PX = 2.0, 4
+# pixels that touch each other and are dark, fewer than which may be dead ones
+_SPECK = 4
 # quotient of a picture under a light, against that of the brightest tenth, from which the surface counts as lit
 _LIT = 0.25
 
@@ -138,7 +140,7 @@ def find_shadows(
             shown = np.maximum(_mean(photograph.under[k]) + _CERTAIN / 3.0 * sigma, grey + _PIXEL * sigma)
             # beside a lit place, what is dark is so by itself
             shown = linear(np.minimum(shown, grey + _CERTAIN * sigma))
-            seen = (shown < limit) & inside & ~too_dark & ~mirrors
+            seen = _without_specks((shown < limit) & inside & ~too_dark & ~mirrors)
             # nothing by lamps whose power is not known
             usable = inside & ~mirrors & (told[k] * least > 0.0)
             most = np.where(usable, shown / np.where(usable, told[k] * least, 1.0), np.inf)
@@ -173,6 +175,12 @@ def doubts_of(reports: Sequence[DetectionReport]) -> list[str]:
     if mirror > _NOTEWORTHY:
         doubts.append(f"{mirror:.0%} of the object mirrors its lights: nothing is carved there by shadows")
     return doubts
+
+
+def _without_specks(dark: Mask) -> Mask:
+    """A mask without what is smaller than some pixels."""
+    pieces, _ = label(dark, np.ones((3, 3)))
+    return np.asarray(dark & (np.bincount(pieces.ravel()) >= _SPECK)[pieces])
 
 
 def quotient_of_lean(angle: float, fan: float) -> float:
