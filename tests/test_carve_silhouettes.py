@@ -72,6 +72,14 @@ def test_photographs_may_be_masks() -> None:
     assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.985
 
 
+@pytest.mark.parametrize("level", [0, 255])
+def test_of_photographs_that_are_masks_one_may_be_empty_or_full(level: int) -> None:
+    pictures = [np.repeat(np.where(c > 0.5, 255, 0).astype(np.uint8)[..., None], 3, axis=2) for c in COVERAGES]
+    pictures[0] = np.full_like(pictures[0], level)
+    _, report = found_in(pictures)
+    assert [bool(mask.problem) for mask in report.masks] == [True, *[False] * (len(pictures) - 1)]
+
+
 def test_background_is_learned() -> None:
     silhouettes, report = found_in(PHOTOGRAPHS)
     assert {mask.source for mask in report.masks} == {"background"}

@@ -175,7 +175,9 @@ def _choose_source(records: Sequence[ImageRecord], options: MaskOptions) -> str:
     asked = (*spread(records, 3), *records)
     if any(read_with_alpha(record)[1] is not None for record in asked if record.has_alpha):
         return "alpha"
-    if all(is_mask(read_rgb(record)) for record in spread(records, 3)):
+    some = [read_rgb(record) for record in spread(records, 3)]
+    # one that is empty or full is named then, and carves nothing
+    if any(map(is_mask, some)) and all(is_mask(each) or (each == each[0, 0, 0]).all() for each in some):
         return "picture"
     return "background"
 

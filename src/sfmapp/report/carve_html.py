@@ -214,18 +214,24 @@ def _limits(limits: LimitsReport, teller: str | None, outlines: str) -> str:
     )
     text += f", its area no less than {limits.area_low:.5g}.</p>" if limits.area_low else ".</p>"
     if limits.hollows:
-        rows = [[("", f"{one.share:.1%}"), ("t", _place(one.at)), ("t", _place(one.faces))] for one in limits.hollows]
+        rows = [
+            [("", f"{one.share:.1%}"), ("t", _place(one.at)), ("t", _direction(one.faces))] for one in limits.hollows
+        ]
         head = [("", "of the surface"), ("t", "unseen about"), ("t", "looks towards")]
         text += table(head, rows[:_NUM_HOLLOWS])
     if limits.next_views:
         rows = [[("t", _place(one.place)), ("", f"{one.gain_share:.1%}")] for one in limits.next_views]
-        head = [("t", "a photograph from here"), ("", "turned to it of the unseen")]
+        head = [("t", "a photograph from here"), ("", "of the surface, unseen so far and turned to it")]
         text += table(head, rows)
     return text
 
 
 def _place(at: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in at) + ")"
+
+
+def _direction(way: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in way) + ")"
 
 
 def _slices(octree: Octree, mesh: Mesh) -> Iterator[str]:

@@ -227,10 +227,15 @@ def _box(what: CarveInput, source: CarveSource, silhouettes: Sequence[Silhouette
     if len(inside) > 0.5 * len(source.views):
         raise InputError(
             f"{len(inside)} of {len(source.views)} cameras stand inside the volume: an object is carved from outside",
-            "check that masks show the object and not the background, or give its box: --box X Y Z X Y Z",
+            "check that masks show the object and not the background, take photographs from more sides, or give its "
+            "box: --box X Y Z X Y Z",
         )
     if inside:
-        job.events.warned("box", f"cameras stand inside the volume: {listed(inside, _NAMES_SHOWN)}")
+        job.events.warned(
+            "box",
+            f"cameras stand where the object may be: {listed(inside, _NAMES_SHOWN)}: if their poses are wrong, so is "
+            "what they carve away: leave them out",
+        )
     return found
 
 
