@@ -13,7 +13,7 @@ from odometry_sequences import PINHOLE, Played, Told, absolute_error, keyframe_m
 from rendered_worlds.worlds import gallery_world
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project, simple_camera
-from sfmapp.errors import UsageError
+from sfmapp.errors import InputError, UsageError
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry import known_map_check
 from sfmapp.odometry.loops.pose_graph import apply_corrections
@@ -24,6 +24,7 @@ from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.report import KnownMapReport
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.odometry.run import run_odometry
+from sfmapp.pipelines.odometry.known_map import check_observations
 from sfmapp.scene.rig import Rig
 from sfmapp.scene.synthetic import make_scene
 
@@ -191,6 +192,25 @@ def test_what_another_camera_has_taken_is_what_ours_would_have() -> None:
 
     picture = as_seen_by(np.rint(shown(wide)).astype(np.uint8), wide, PINHOLE)
     assert np.abs(picture - shown(PINHOLE))[2:-2, 2:-2].max() < 2.0
+
+
+def test_a_map_that_contradicts_its_own_images_is_refused() -> None:
+    """One keyframe that is turned is what a map may bear; when all have drifted away from their points it is none."""
+    known = known_map()
+    check_observations(known)
+    model = known.model.copy()
+    worst = int(known.image_idx[2, 0])
+    turned = rigid3.from_matrix(rigid3.exp_so3(np.array([0.0, 0.1, 0.0])), np.zeros(3))
+    model.move_images(np.array([worst]), rigid3.compose(turned, model.cam_from_world[[worst]]))
+    check_observations(replace(known, model=model))
+    others = np.setdiff1d(known.image_idx[:, 0], worst)
+    slightly = rigid3.from_matrix(rigid3.exp_so3(np.array([0.0, 0.03, 0.0])), np.zeros(3))
+    model.move_images(others, rigid3.compose(slightly, model.cam_from_world[others]))
+    # 0.03 radians of 262 pixels in the middle of the picture, and 1.4 times as much at its sides
+    with pytest.raises(
+        InputError, match=rf"OUT: .* more than (8|9)\.\d px off, those of {model.image_names[worst]} most"
+    ):
+        check_observations(replace(known, model=model))
 
 
 def test_two_cameras_have_no_use_for_a_map_of_one() -> None:

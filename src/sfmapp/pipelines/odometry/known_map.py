@@ -15,6 +15,7 @@ from sfmapp.events import Events
 from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.images.pixels import as_gray, read_gray
 from sfmapp.images.sequence_source import SequenceSource
+from sfmapp.odometry.loops.relocalize import RelocalizeOptions
 from sfmapp.odometry.map.known_map import PREFIX, KnownMap, as_seen_by, is_same
 from sfmapp.odometry.refinement.final_adjustment import rig_of
 from sfmapp.pipelines.metres import metre_sigma_of_run
@@ -58,7 +59,7 @@ def read_known_map(folder: Path, options: Options, events: Events, above: tuple[
         above: maps that were made in this one, from whose reading this is called.
 
     Raises:
-        InputError, UsageError: it is none of these, or its frames or photographs are gone.
+        InputError, UsageError: it is none of these, its frames or photographs are gone, or it contradicts itself.
         NoReconstructionError: it holds no map.
     """
     events.started(STAGE, f"reading the map in {folder}")
@@ -67,8 +68,35 @@ def read_known_map(folder: Path, options: Options, events: Events, above: tuple[
     else:
         found = ReadMap(_of_photographs(folder, options, events))
     known = found.known
+    check_observations(known)
     events.finished(STAGE, f"{len(known.image_idx)} keyframes, {len(known.pictures)} of them with a picture")
     return found
+
+
+def check_observations(known: KnownMap) -> None:
+    """Refuse a map whose points are not where its own images show them: whatever is found by them is wrong.
+
+    Raises:
+        InputError: half of the observations are farther off than an inlier of a localised image may be.
+    """
+    model = known.model
+    chosen = np.flatnonzero(model.obs_is_inlier)
+    if not len(chosen):
+        return
+    # what lies behind its camera has no residual
+    off = np.nan_to_num(np.linalg.norm(model.residuals_px()[chosen], axis=1), nan=np.inf)
+    image = model.tracks.obs_image_idx[chosen]
+    limit = RelocalizeOptions().error_px(model.cameras[model.image_camera_idx[image[0]]])
+    middle = float(np.median(off))
+    if middle <= limit:
+        return
+    images = np.unique(image)
+    worst = int(images[np.argmax([np.median(off[image == k]) for k in images])])
+    raise InputError(
+        f"{known.source}: expected the points of the map where its own images show them, to {limit:.1f} px, found half "
+        f"of the observations more than {middle:.1f} px off, those of {model.image_names[worst]} most",
+        "its points, poses and cameras are not of one adjustment: map it again",
+    )
 
 
 def _of_odometry(folder: Path, options: Options, events: Events, above: tuple[Path, ...]) -> ReadMap:
