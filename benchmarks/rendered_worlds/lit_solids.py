@@ -111,6 +111,40 @@ def jug() -> Solid:
     )  # fmt: skip
 
 
+def rack() -> Solid:
+    """Thin shelves on posts before a wall, with a bowl and a slot: thin parts, and hollows between them."""
+    posts = [shape(CYLINDER, (x, -0.3, -0.1), (0.05, 0.45)) for x in (-0.45, 0.45)]
+    return Solid(
+        np.array([
+            shape(BOX, (0, 0, -0.52), (0.6, 0.42, 0.06)),
+            shape(BOX, (0, 0, -0.12), (0.55, 0.38, 0.03), rounding=0.01, albedo=0.5),
+            shape(BOX, (0, 0, 0.28), (0.55, 0.38, 0.03), rounding=0.01),
+            shape(BOX, (0, 0.34, -0.1), (0.5, 0.05, 0.45), albedo=0.7),
+            *posts,
+            shape(BALL, (0.2, -0.05, 0.5), 0.24),
+            shape(BALL, (0.2, -0.05, 0.62), 0.2, taken=True, albedo=0.5),
+            shape(BOX, (-0.25, -0.2, -0.48), (0.2, 0.06, 0.1), taken=True),
+        ]),
+        1.0,
+    )  # fmt: skip
+
+
+def wheel() -> Solid:
+    """A thin rim about a hub with a blind hole, held by spokes, on a foot."""
+    spokes = [shape(CYLINDER, (0, 0, 0.1), (0.045, 0.55), turn=(t, 0.0, 0.0)) for t in (0.3, 1.35, 2.4)]
+    return Solid(
+        np.array([
+            shape(RING, (0, 0, 0.1), (0.58, 0.07), turn=X),
+            shape(CYLINDER, (0, 0, 0.1), (0.2, 0.22), turn=X, albedo=0.5),
+            *spokes,
+            shape(BOX, (0, 0, -0.66), (0.3, 0.4, 0.14)),
+            shape(CYLINDER, (0.2, 0, 0.1), (0.11, 0.3), taken=True, turn=X, albedo=0.7),
+            shape(BALL, (0.0, -0.42, -0.45), 0.2, taken=True),
+        ]),
+        1.0,
+    )  # fmt: skip
+
+
 def drawn(seed: int) -> Solid:
     """A lump of rounded shapes with hollows, drawn at random."""
     rng = np.random.default_rng([seed, 0x50C1D])
