@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import sfmapp
 from carving_scenes import (
     Solid,
     around,
@@ -31,6 +32,7 @@ from sfmapp.carve.voxel_coloring import VoxelOptions, carve_by_color, shown_cell
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
+from sfmapp.pipelines.carve.run import CarveInput, carve
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -156,14 +158,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_colors_hollow_out_what_silhouettes_leave_full(folder: Path, tmp_path: Path) -> None:
-    command = ["carve", str(folder), "-o", str(tmp_path / "out"), "--cells", "64", "--no-recording", "-q", "--colors"]
-    assert main(command) == 0
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+@pytest.fixture(scope="module")
+def carved(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("carved") / "out"
+    assert main(["carve", str(folder), "-o", str(out), "--cells", "64", "--no-recording", "-q", "--colors"]) == 0
+    return out
+
+
+def test_colors_hollow_out_what_silhouettes_leave_full(carved: Path) -> None:
+    report = json.loads((carved / "report.json").read_text())
     assert report["sights"]["num_maps"] >= 12
     assert report["joining"]["hull_volume"] > 1.5 * VOLUME
     assert 0.95 * VOLUME < report["surface"]["volume"] < 1.35 * VOLUME
-    left = grid_of(read_octree(tmp_path / "out" / "octree_colors.npz"))
+    left = grid_of(read_octree(carved / "octree_colors.npz"))
     xyz = np.random.default_rng(5).uniform(-0.8, 0.8, (40000, 3))
     deep, hollow = 2.0 * left.tree.cell, box((0.6, 0.4, 0.35), (0.0, 0.0, 0.15))
     assert left.holds(xyz[CUP(xyz) < -deep]).mean() > 0.98
@@ -171,6 +178,29 @@ def test_colors_hollow_out_what_silhouettes_leave_full(folder: Path, tmp_path: P
     # painted alike from everywhere: photographs that look from far apart differ little more than neighbours
     differences = {row["from_deg"]: row["levels"] for row in report["colors"]["differences"]}
     assert differences[15.0] < 40.0
+
+
+def test_colors_that_were_stopped_go_on_to_the_same_bytes(folder: Path, carved: Path, tmp_path: Path) -> None:
+    what, options = CarveInput(folder, by_colors=True), sfmapp.load_options(settings=["carve.cells=64"])
+    events = sfmapp.Events()
+
+    def stop(event: sfmapp.Event) -> None:
+        if event.kind == "advanced" and event.stage == "join":
+            events.cancel()
+
+    events.subscribe(stop)
+    with pytest.raises(sfmapp.InterruptedRunError):
+        carve(what, tmp_path / "out", options, record=False, events=events)
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+    found = carve(what, tmp_path / "out", options, record=False)
+    assert "sights" not in found.report.usage
+    for name in ("mesh.ply", "octree_colors.npz", "sights.npz"):
+        assert (tmp_path / "out" / name).read_bytes() == (carved / name).read_bytes()
+    # a file that was cut off is made again
+    (tmp_path / "out" / "sights.npz").write_bytes((carved / "sights.npz").read_bytes()[:1000])
+    found = carve(what, tmp_path / "out", options, record=False)
+    assert "sights" in found.report.usage
+    assert (tmp_path / "out" / "mesh.ply").read_bytes() == (carved / "mesh.ply").read_bytes()
 
 
 def test_colors_and_patches_are_not_joined(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,9 @@
-"""An octree as a file of arrays, and one joined with patches."""
+"""An octree as a file of arrays, one joined with patches, and what photographs see of a surface."""
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.joined import Joined, Nodes
 from sfmapp.carve.octree import MAX_DEPTH, Octree
+from sfmapp.carve.sight import Sight, sight_of_map
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file
 
 _NAMES = ("low", "side", "full", "level_starts", "surface")
 _JOINED_NAMES = ("band", "node_starts", "node_codes", "node_distance")
+_SIGHT_NAMES = ("k", "cam_from_world", "shape", "depth")
 
 
 def write_octree(path: Path, octree: Octree) -> None:
@@ -55,6 +58,44 @@ def write_joined(path: Path, joined: Joined) -> None:
         "node_distance": np.concatenate([nodes.distance for nodes in joined.nodes]),
     }
     _write(path, _arrays(joined.tree) | nodes)
+
+
+def write_sights(path: Path, sights: Sequence[Sight]) -> None:
+    """Write sights that :func:`~sfmapp.carve.sight.sight_of_map` made as NumPy's compressed archive.
+
+    ================== ====== ==========================================================================================
+    ``k``              (S, 4) ``fx, fy, cx, cy`` in pixels of the map, the centre of the top-left one (0.5, 0.5)
+    ``cam_from_world`` (S, 7) pose, see :mod:`sfmapp.geometry.rigid3`
+    ``shape``          (S, 2) int64 height and width of each map
+    ``depth``          (N,)   float32 the maps one after another, row by row, units of the world; NaN: not known
+    ================== ====== ==========================================================================================
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    maps = {
+        "k": np.array([sight.k for sight in sights]),
+        "cam_from_world": np.array([sight.cam_from_world for sight in sights]),
+        "shape": np.array([sight.depth.shape for sight in sights], np.int64),
+        "depth": np.concatenate([sight.depth.ravel() for sight in sights]),
+    }
+    _write(path, maps)
+
+
+def read_sights(path: Path) -> list[Sight]:
+    """Read what :func:`write_sights` wrote, the same to the last bit. Raises InputError if it is no such file, or
+    damaged."""
+    k, poses, shape, depth = _read(path, _SIGHT_NAMES)
+    num = len(shape) if shape.ndim else 0
+    is_sound = (
+        k.shape == (num, 4) and poses.shape == (num, 7) and shape.shape == (num, 2) and shape.dtype == np.int64
+        and depth.dtype == np.float32 and depth.ndim == 1 and (shape > 0).all()
+        and int(shape.prod(axis=1).sum()) == len(depth)
+    )  # fmt: skip
+    if not is_sound:
+        raise InputError(f"{path}: expected depth maps of photographs, found other arrays, or damaged ones")
+    parts = np.split(depth, np.cumsum(shape.prod(axis=1))[:-1])
+    return [sight_of_map(*sight) for sight in zip(k, poses, map(np.reshape, parts, shape), strict=True)]
 
 
 def _arrays(octree: Octree) -> dict[str, Any]:
@@ -107,4 +148,4 @@ def _read(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
         with np.load(path, allow_pickle=False) as archive:
             return [archive[name] for name in names]
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(f"{path}: expected the octree of a volume: {error}") from None
+        raise InputError(f"{path}: expected arrays of a volume: {error}") from None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfmapp.carve.views import View
 from sfmapp.dense.maps import splat_view
-from sfmapp.dense.scene import DenseView, Patches
+from sfmapp.dense.scene import Patches
 from sfmapp.errors import InputError
 from sfmapp.geometry import rigid3
 
@@ -75,11 +75,11 @@ def sights_of_patches(views: Sequence[View], patches: Patches, names: Sequence[s
     return sights
 
 
-def sight_of_map(view: DenseView, depth: NDArray[np.float32]) -> Sight:
+def sight_of_map(k: Array, cam_from_world: Array, depth: NDArray[np.float32]) -> Sight:
     """What a photograph sees by its depth map (H, W), NaN where nothing is known; normals by differences of it."""
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    ray = np.stack([(x - view.k[2]) / view.k[0], (y - view.k[3]) / view.k[1], np.ones_like(x)], axis=-1)
+    ray = np.stack([(x - k[2]) / k[0], (y - k[3]) / k[1], np.ones_like(x)], axis=-1)
     points = ray * depth[..., None]
     across, down = np.full_like(points, np.nan), np.full_like(points, np.nan)
     across[:, 1:-1] = points[:, 2:] - points[:, :-2]
@@ -91,8 +91,8 @@ def sight_of_map(view: DenseView, depth: NDArray[np.float32]) -> Sight:
     cosine = -(normal * ray).sum(axis=-1)
     normal = np.where((cosine > _LEAST_COSINE)[..., None], normal, -ray).astype(np.float32)
     known = np.isfinite(depth)
-    pixel = float(np.median(depth[known])) / float(np.sqrt(view.k[0] * view.k[1])) if known.any() else np.inf
-    return Sight(view.k, view.cam_from_world, depth, normal, pixel)
+    pixel = float(np.median(depth[known])) / float(np.sqrt(k[0] * k[1])) if known.any() else np.inf
+    return Sight(k, cam_from_world, depth, normal, pixel)
 
 
 def _sight(view: View, xyz: Array, normal: NDArray[np.float32], size: NDArray[np.float32]) -> Sight:

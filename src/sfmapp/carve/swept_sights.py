@@ -86,7 +86,9 @@ def sights_by_colors(
 
         maps = list(pool.map(measure, range(num)))
         kept = list(pool.map(lambda v: _confirmed(scene, maps, v), range(num)))
-    sights = [sight_of_map(views[v], depth) for v, depth in enumerate(kept) if depth is not None]
+    sights = [
+        sight_of_map(views[v].k, views[v].cam_from_world, depth) for v, depth in enumerate(kept) if depth is not None
+    ]
     if not sights:
         raise NoReconstructionError(
             f"no depth of {num} photographs is confirmed by another one",

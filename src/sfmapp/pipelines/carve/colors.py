@@ -5,15 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from sfmapp.carve.box import Box
+from sfmapp.carve.files import read_sights, write_sights
 from sfmapp.carve.joined import Evidence, JoinOptions
 from sfmapp.carve.octree import Octree
+from sfmapp.carve.sight import Sight
 from sfmapp.carve.swept_sights import SightsReport, sights_by_colors
 from sfmapp.errors import InputError
 from sfmapp.pipelines.carve.joining import Joining, Photographs, join_in_box
+from sfmapp.pipelines.carve.outputs import SEEING, SIGHTS, earlier
 from sfmapp.pipelines.carve.sources import CarveSource
 from sfmapp.pipelines.carve.undistorted import undistorted
+from sfmapp.reporting import from_plain
 from sfmapp.workspace.job import Job
+from sfmapp.workspace.keys import stage_key
+from sfmapp.workspace.layout import CARVE
 
+STAGE = "sights"
 # of colours, mask, the four maps of a sweep, and those of a sight
 _PIXEL_BYTES = 36.0
 # a photograph that is finer than so many pixels for a cell says no more
@@ -34,20 +41,41 @@ def join_colors(
         InputError: cameras are matrices.
         NoReconstructionError: colours tell nothing, or see through all of the hull.
     """
-    cameras = [view.camera for view in source.views if view.camera is not None]
-    if not cameras:
+    if all(view.camera is None for view in source.views):
         raise InputError(
             "--colors: expected cameras with a lens and a pose, found projection matrices",
             "carve by silhouettes, or give poses and a lens",
         )
-    surface = octree.centers(octree.surface)
-    away = [np.linalg.norm(view.center - surface.mean(axis=0)) for view in source.views if view.camera is not None]
-    pixels = [octree.cell * camera.k_matrix[0, 0] / d for camera, d in zip(cameras, away, strict=True)]
-    with job.stage("sights"):
-        shrink = float(np.median(pixels)) / _PIXELS_A_CELL
-        views = undistorted(job, source, _PIXEL_BYTES, photographs.silhouettes, shrink=max(1.0, shrink))
-        sights, report = sights_by_colors(views, surface, job.events, threads=job.threads)
+    sights, report = _sights(job, source, photographs, octree)
     with job.stage("join"):
         evidence = Evidence(photographs.views, photographs.silhouettes, photographs.hull, sights)
         joined, joining = join_in_box(job, evidence, octree, box, JOIN)
     return Joining(joined, joining, evidence, octree), report
+
+
+def _sights(
+    job: Job, source: CarveSource, photographs: Photographs, octree: Octree
+) -> tuple[list[Sight], SightsReport]:  # fmt: skip
+    """What colours tell, swept as finely as cells are; that of an earlier call with the same volume."""
+    # the octree's own key tells the photographs, their cameras and silhouettes
+    key = stage_key((__name__,), None, job.options.dense.max_memory_mb, job.workspace.manifest.stage(CARVE).key)
+    path = job.workspace.folder / SIGHTS
+
+    def read() -> tuple[list[Sight], SightsReport]:
+        return read_sights(path), from_plain(SightsReport, job.workspace.read_json(SEEING))
+
+    found = earlier(job, STAGE, key, read, "colours were looked at by an earlier call")
+    if found is not None:
+        return found
+    surface = octree.centers(octree.surface)
+    posed = [(view, view.camera) for view in source.views if view.camera is not None]
+    away = [np.linalg.norm(view.center - surface.mean(axis=0)) for view, _ in posed]
+    pixels = [octree.cell * camera.k_matrix[0, 0] / d for (_, camera), d in zip(posed, away, strict=True)]
+    shrink = float(np.median(pixels)) / _PIXELS_A_CELL
+    with job.stage(STAGE, key):
+        views = undistorted(job, source, _PIXEL_BYTES, photographs.silhouettes, shrink=max(1.0, shrink))
+        sights, report = sights_by_colors(views, surface, job.events, threads=job.threads)
+        write_sights(path, sights)
+        job.workspace.write_json(SEEING, report)
+    job.workspace.save()  # a call that is stopped from here on need not look again
+    return sights, report

@@ -25,6 +25,8 @@ COLORED = "octree_colors.npz"
 JOINED = "joined.npz"
 # what carving and joining said of themselves, for a call that resumes
 CARVING, JOINING = "octree.json", "joined.json"
+# what colours told of depth, for a call that resumes, and what was said of it
+SIGHTS, SEEING = "sights.npz", "sights.json"
 # what is known of each vertex
 EVIDENCE = "evidence"
 T = TypeVar("T")
