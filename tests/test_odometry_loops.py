@@ -193,7 +193,7 @@ def test_places_find_the_revisit(walked: tuple[KeyframeMap, PlaceIndex], wall: W
         pose = keyframes.keyframes[n].rig_from_world.copy()
         pose[4] += 0.25
         image = wall.photograph(pose, 999, 1.2)
-        found = places.query_view(View(image, corners(image)))
+        found = places.query_view(View(image, corners(image)), 0.0, (0,))
         assert abs(found[0].frame_idx - n) <= 1
         assert found[0].similarity > 2 * found[-1].similarity
 

@@ -34,6 +34,8 @@ _CORNERS, _CORNER_DISTANCE_PX = 1000, 5.0
 # Rolls at which a lost frame is looked at, one after the other: descriptors bear 15 degrees.
 _ROLLS_DEG = (0.0, 25.0, -25.0)
 
+# Of lost frames that fit several places of a known map, every so many is held against it: the next shows the same.
+_OPEN = 5
 # Keyframes after which one is held against a known map in any case.
 _LOOK_AGAIN = 3
 
@@ -53,7 +55,7 @@ class Recognition:
 
     def __init__(self, seed: int, executor: Executor | None = None) -> None:
         self._places, self._finder = PlaceIndex(seed=seed, executor=executor), LoopFinder()
-        self._num_searches, self._seed = 0, seed
+        self._num_searches, self._num_waited, self._seed = 0, 0, seed
         self.belief: PlaceBelief | None = None
         # keyframe of the current map up to which no loop is looked for
         self._resting_until = 0
@@ -186,12 +188,18 @@ class Recognition:
         if len(corners) < _MIN_CORNERS:
             return None
         keyframes = {number: local.keyframes for number, local in maps.items()}
-        roll, self._num_searches = math.radians(_ROLLS_DEG[self._num_searches % 3]), self._num_searches + 1
-        seen = PlaceView(view.images[0], corners)
-        found = self._find_known(keyframes, seen, roll)
+        is_open = self.belief is not None and self.belief.is_open
+        if not is_open:  # a frame that fits several places is turned as it should be
+            self._num_searches += 1
+        self._num_waited = (self._num_waited + 1) % _OPEN if is_open else 0
+        roll = math.radians(_ROLLS_DEG[(self._num_searches - 1) % 3])
+        seen, found = PlaceView(view.images[0], corners), None
+        if self.belief is not None:
+            known = keyframes.pop(self.belief.map_idx)
+            if self._num_waited == 0:
+                found = self._find_known(known, seen, roll)
         if found is None:
-            barred = None if self.belief is None else self.belief.map_idx
-            found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll, barred)
+            found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll)
         if found is None:
             return None
         located = found.located
@@ -203,12 +211,11 @@ class Recognition:
             corners[located.corner_idx],
         )
 
-    def _find_known(self, keyframes: dict[int, KeyframeMap], seen: PlaceView, roll: float) -> Relocalization | None:
-        """Find a lost frame in the known map, if there is one and no other place of it might be the right one."""
+    def _find_known(self, known: KeyframeMap, seen: PlaceView, roll: float) -> Relocalization | None:
+        """Find a lost frame in the known map, where no other place of it might be the right one."""
         belief = self.belief
-        if belief is None:
-            return None
-        belief.look(keyframes[belief.map_idx], seen, roll)
+        assert belief is not None
+        belief.look(known, seen, roll)
         decided = belief.decided
         if decided is None or decided.located is None:
             return None

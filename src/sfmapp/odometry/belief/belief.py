@@ -47,6 +47,8 @@ _NOT_IN_MAP = 0.5
 _NUM_LOOKS = 12
 # Most places that are looked at, and the log likelihood ratio below which a place is no longer looked at.
 _MAX_MODES, _HOPELESS = 24, 20.0
+# Most landmarks that one look asks for, of all that are expected.
+_MAX_EXPECTED = 250
 # Share of the weight of particles that a new measurement brings into a set (Thrun, Fox, Burgard and Dellaert, "Robust
 # Monte Carlo localization for mobile robots", 2001: the mixture proposal).
 _RESEEDED = 0.25
@@ -161,7 +163,7 @@ class PlaceBelief:
             if not self._is_hopeless(mode):
                 self._judge(mode, look, is_newest=True)
         held = {mode.place for mode in self.modes if mode.located is not None}
-        for candidate in self._places.query_view(view, roll, self.map_idx):
+        for candidate in self._places.query_view(view, roll, (self.map_idx,)):
             if candidate.frame_idx in held:  # the image lies there already
                 continue
             located = locate(keyframes, self._places, view, candidate, self._options, roll)
@@ -179,10 +181,15 @@ class PlaceBelief:
 
     def _count(self) -> None:
         self.num_looks += 1
-        self._num_open += self.decided is None and sum(m.score.support > 0.0 for m in self.modes) > 1
+        self._num_open += self.is_open
         self._max_particles = max(self._max_particles, sum(len(m.particles) for m in self.modes))
         if self.decided is not None and self._num_looks_to_decision is None:
             self._num_looks_to_decision = self.num_looks
+
+    @property
+    def is_open(self) -> bool:
+        """The last image fitted several places, of which none is believed."""
+        return self.decided is None and sum(mode.score.support > 0.0 for mode in self.modes) > 1
 
     def state(self) -> BeliefState:
         """What is believed now."""
@@ -284,6 +291,7 @@ class PlaceBelief:
         if held is not None:
             pose = held[0].cam_from_world
         expected = local.subset(self._scene.expects(local, pose))
+        expected = expected.subset(np.arange(0, len(expected.point_id), 1 + len(expected.point_id) // _MAX_EXPECTED))
         point_id, agrees = agreeing_at(expected, look.view, camera, pose)
         mode.tally.add(point_id, agrees)
         if not is_newest:
@@ -317,7 +325,9 @@ class PlaceBelief:
         look_alikes = self._scene.look_alikes
         for mode in self.modes:
             clusters = mode.tally.clusters(look_alikes.cluster)
-            mode.score = mode.tally.score(look_alikes.cluster, clusters[look_alikes.is_repeated(clusters)])
+            mode.score = mode.tally.score(look_alikes.cluster, clusters)
+            if mode.score.support > 0.0:
+                mode.score = mode.tally.score(look_alikes.cluster, clusters[look_alikes.is_repeated(clusters)])
         share = math.log((1.0 - _NOT_IN_MAP) / max(len(self._scene.frame_idx), 1))
         logs = np.array([math.log(_NOT_IN_MAP), *[share + mode.score.total for mode in self.modes]])
         shares = np.exp(logs - logs.max())

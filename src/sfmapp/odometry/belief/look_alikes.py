@@ -6,6 +6,7 @@ just short. The map itself tells it once more.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -31,12 +32,13 @@ _SHARED = 15
 # Edge of the cubes that make landmarks a cluster, in median depths.
 _CLUSTER_DEPTHS = 0.2
 # Landmarks are twins below this distance of their unit descriptors: that of one landmark seen twice has its median at
-# 0.25 to 0.35, that to the most similar other one of a furnished room at 0.6 (5 % are below 0.43).
-_TWIN_DISTANCE = 0.5
-# A cluster is there twice if this share of its landmarks have their twins together: so it is of 83 % of the clusters of
-# a hall of equal bays, and of 8 % of those of a room.
-_TWIN_SHARE = 0.25
+# 0.25 to 0.35, that to the most similar other one of a furnished room at 0.6. Most of them that count of one landmark.
+_TWIN_DISTANCE, _NUM_TWINS = 0.5, 4
+# Clusters that are taken to be there twice by chance: they only speak for no place.
+_CHANCE = 0.1
 _SIFT_NORM2 = 512 * 512
+# Landmarks that are held against all others at a time.
+_BLOCK = 256
 
 
 class LookAlikes:
@@ -74,25 +76,52 @@ class LookAlikes:
 
     def is_repeated(self, clusters: Ids) -> Mask:
         """(C,) which clusters have a like elsewhere in the map."""
-        new = clusters[~self._is_known[clusters]]
-        if not len(new):
-            return self._is_repeated[clusters]
-        mine = np.flatnonzero(np.isin(self.cluster[self._ids], new))
-        least = _SIFT_NORM2 * (1.0 - 0.5 * _TWIN_DISTANCE**2)
-        products = self._descriptors[mine] @ self._descriptors.T
-        first, twin = np.nonzero(products > least)
-        apart = ((self._xyz[mine[first]] - self._xyz[twin]) ** 2).sum(1) > (2.0 * self._edge) ** 2
-        first, twin = first[apart], twin[apart]
-        owner = self.cluster[self._ids[mine]]
-        for c in new.tolist():
-            rows = np.flatnonzero(owner[first] == c)
-            at, whose = self._xyz[twin[rows]], first[rows]
-            # as many landmarks as have a twin within one ball
-            near = ((at[:, None] - at[None]) ** 2).sum(2) < self._edge**2
-            most = max((len(np.unique(whose[n])) for n in near), default=0)
-            self._is_repeated[c] = most >= _TWIN_SHARE * np.count_nonzero(owner == c)
-        self._is_known[new] = True
+        self._find_twins(clusters[~self._is_known[clusters]])
         return self._is_repeated[clusters]
+
+    def _find_twins(self, clusters: Ids) -> None:
+        """Find out which of some clusters have a like."""
+        if not len(clusters):
+            return
+        mine = np.flatnonzero(np.isin(self.cluster[self._ids], clusters))
+        owner = self.cluster[self._ids[mine]]
+        least = _SIFT_NORM2 * (1.0 - 0.5 * _TWIN_DISTANCE**2)
+        found = []
+        for block in range(0, len(mine), _BLOCK):
+            products = self._descriptors[mine[block : block + _BLOCK]] @ self._descriptors.T
+            first, twin = np.nonzero(products > least)
+            apart = ((self._xyz[mine[block + first]] - self._xyz[twin]) ** 2).sum(1) > (2.0 * self._edge) ** 2
+            first, twin = first[apart], twin[apart]
+            order = np.lexsort((-products[first, twin], first))
+            first, twin = first[order], twin[order]
+            rank = np.arange(len(first)) - np.searchsorted(first, first)
+            found.append(np.stack([block + first, twin])[:, rank < _NUM_TWINS])
+        first, twin = np.concatenate(found, 1)
+        for c in clusters.tolist():
+            rows = owner[first] == c
+            self._is_repeated[c] = self._are_together(first[rows], self._xyz[twin[rows]], int((owner == c).sum()))
+        self._is_known[clusters] = True
+
+    def _are_together(self, first: Ids, at: Array, num: int) -> bool:
+        """Whether more of the landmarks of a cluster have twins in one ball than do by chance.
+
+        Twins by chance lie where any landmark lies: that k of n landmarks with t twins each have one in the ball around
+        another twin is expected less than C(n, k) t^k p^(k - 1) times, p being the share of all landmarks in it.
+
+        Args:
+            first: (T,) whose twins. at: (T, 3) where these are. num: of landmarks of the cluster.
+        """
+        if len(first) < 2:
+            return False
+        near = ((at[:, None] - at[None]) ** 2).sum(2) < self._edge**2
+        together = np.array([len(np.unique(first[n])) for n in near])
+        most = int(together.max())
+        if most < 2:
+            return False
+        center = at[int(together.argmax())]
+        share = float((((self._xyz - center) ** 2).sum(1) < self._edge**2).mean())
+        log_expected = math.log(math.comb(num, most)) + most * math.log(len(first) / num) + (most - 1) * math.log(share)
+        return log_expected < math.log(_CHANCE)
 
     def around(self, frame_idx: int, depth: float) -> list[Array]:
         """Motions (7,) of the world that take what a keyframe sees to its likes.

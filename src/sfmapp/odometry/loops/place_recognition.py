@@ -14,7 +14,7 @@ tracking, which takes it over a fixed number of places later; every keyframe is 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Container, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
@@ -217,9 +217,9 @@ class PlaceIndex:
         reference = self._reference[row]
         return self._best(self._vectors[row], allowed, reference if np.isfinite(reference) else self._usual(), False)
 
-    def query_view(self, view: View, roll: float = 0.0, map_idx: int | None = None) -> list[Candidate]:
-        """Places that look like an image, of one map or of any; without a vocabulary yet, the last places."""
-        allowed = np.array([map_idx is None or place.map_idx == map_idx for place in self._places], bool)
+    def query_view(self, view: View, roll: float, maps: Container[int]) -> list[Candidate]:
+        """Places of some maps (by their numbers) that look like an image; without a vocabulary yet, the last places."""
+        allowed = np.array([place.map_idx in maps for place in self._places], bool)
         if self._words is None:
             last = np.flatnonzero(allowed)[: -1 - self.options.num_candidates * _ISLAND : -_ISLAND]
             latest = [self._places[k] for k in last]

@@ -115,20 +115,16 @@ class Relocalization:
 
 
 def relocalize(
-    maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0,
-    barred: int | None = None,
-) -> Relocalization | None:  # fmt: skip
+    maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0
+) -> Relocalization | None:
     """Find an image in any of the maps.
 
     Args:
         maps: by the number that they have in ``places``.
         roll: radians by which the image is thought to be turned against the keyframes, from x to y. Descriptors bear
             15 degrees of error, so try 0 and, on other frames, plus and minus 25 degrees.
-        barred: number of a map that is not looked into.
     """
-    for candidate in places.query_view(view, roll):
-        if candidate.map_idx == barred:
-            continue
+    for candidate in places.query_view(view, roll, maps):
         found = locate(maps[candidate.map_idx], places, view, candidate, options, roll)
         if found is not None and is_convincing(found, view, options):
             return Relocalization(candidate.map_idx, candidate.frame_idx, found)
