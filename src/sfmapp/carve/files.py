@@ -147,5 +147,8 @@ def _read(path: Path, names: tuple[str, ...]) -> list[NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return [archive[name] for name in names]
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(f"{path}: expected arrays of a volume: {error}") from None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, AttributeError):
+        # what numpy says of other files is that they could be loaded "unsafely"
+        raise InputError(
+            f"{path}: expected an archive of {', '.join(names)}, found another file, or a damaged one"
+        ) from None

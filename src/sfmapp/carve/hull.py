@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,6 +44,31 @@ class Nearest(NamedTuple):
     num_views: NDArray[np.int32]
 
 
+class HeldSilhouettes(Sequence[Silhouette]):
+    """Silhouettes (V) out of the distances that kernels read, to 1 / 64 pixel and 512 pixels at most, each made when it
+    is asked for: two bytes a pixel in place of six.
+    """
+
+    def __init__(self, fields: Fields, order: NDArray[np.int64], silhouettes: Sequence[Silhouette]) -> None:
+        self._fields, self._place = fields, np.argsort(order)
+        self._rest = [(each.known, each.outline_sigma_px, each.source) for each in silhouettes]
+
+    def __len__(self) -> int:
+        return len(self._rest)
+
+    @overload
+    def __getitem__(self, index: int) -> Silhouette: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Silhouette]: ...
+    def __getitem__(self, index: int | slice) -> Silhouette | list[Silhouette]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        at, fields = self._place[index], self._fields
+        start, (height, width) = fields.starts[at], fields.sizes[at]
+        steps = fields.distance[start : start + height * width].reshape(height, width)
+        return Silhouette(steps.astype(np.float32) / np.float32(STEPS), *self._rest[index])
+
+
 @dataclass(frozen=True)
 class Hull:
     """Silhouettes and their cameras, ready for kernels.
@@ -54,12 +79,14 @@ class Hull:
             be, so that a cell that is outside is soon told to be.
         min_views: views that have to show a point inside for it to be in the hull.
         misses: views that may show it outside.
+        silhouettes: V that it is made of, in the order in which they were given.
     """
 
     fields: Fields
     order: NDArray[np.int64]
     min_views: int
     misses: int
+    silhouettes: HeldSilhouettes
 
     def __len__(self) -> int:
         return len(self.order)
@@ -180,7 +207,8 @@ def hull_of(
     )
     num_telling = sum(s.known is None or bool(s.known.any()) for s in silhouettes)
     least = max(2, (num_telling + 1) // 2) if min_views is None else min_views
-    return Hull(fields, np.array(order), min(least, len(views)), misses)
+    held = HeldSilhouettes(fields, np.array(order), silhouettes)
+    return Hull(fields, np.array(order), min(least, len(views)), misses, held)
 
 
 def outline_error(views: Sequence[View], silhouettes: Sequence[Silhouette], at: Array) -> float:

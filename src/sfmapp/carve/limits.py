@@ -119,57 +119,66 @@ class SeenFaces:
     """Which triangles (F) of a closed mesh photographs see from in front, unhidden, one photograph after another.
 
     Attributes:
-        centers, normals: (F, 3), world. areas: (F,). edge: that of a typical triangle, units of the world.
+        areas: (F,). edge: that of a typical triangle, units of the world.
         is_seen: (F,) by any so far.
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        num = len(mesh.faces)
-        self.centers, self.normals, self.areas = np.empty((num, 3)), np.empty((num, 3)), np.empty(num)
-        _lay_out(np.ascontiguousarray(mesh.xyz), mesh.faces, self.centers, self.normals, self.areas)
+        self._xyz, self._faces = np.ascontiguousarray(mesh.xyz), mesh.faces
+        self.areas = face_areas(mesh.xyz, mesh.faces)
         self.edge = float(np.sqrt(np.median(self.areas)) * 1.5)
-        self.is_seen = np.zeros(num, np.bool_)
+        self.is_seen = np.zeros(len(mesh.faces), np.bool_)
 
     def add(self, view: View, depth: NDArray[np.float32]) -> None:
         """A photograph more, and the depths (H, W) that it shows of the mesh."""
-        _mark_seen(view.row, view.center, self.centers, self.normals, depth, _HIDDEN_EDGES * self.edge, self.is_seen)
+        hidden = _HIDDEN_EDGES * self.edge
+        _mark_seen(view.row, view.center, self._xyz, self._faces, depth, hidden, self.is_seen)
+
+    def lay_out(self) -> tuple[Array, Array]:
+        """Middles (F, 3) and unit normals (F, 3) of the triangles, world."""
+        centers, normals = np.empty((len(self.areas), 3)), np.empty((len(self.areas), 3))
+        _lay_out(self._xyz, self._faces, centers, normals)
+        return centers, normals
 
 
 @numba.njit(cache=True, nogil=True)
-def _lay_out(xyz: Array, faces: NDArray[np.int32], centers: Array, normals: Array, areas: Array) -> None:
-    """Middles (F, 3), unit normals and areas (F,) of triangles."""
+def _lay_out_face(xyz: Array, a: int, b: int, c: int, center: Array, normal: Array) -> None:
+    """Middle (3,) and unit normal (3,) of a triangle."""
+    total = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        center[k] = (xyz[a, k] + xyz[b, k] + xyz[c, k]) / 3.0
+        normal[k] = 0.5 * (
+            (xyz[b, i] - xyz[a, i]) * (xyz[c, j] - xyz[a, j]) - (xyz[b, j] - xyz[a, j]) * (xyz[c, i] - xyz[a, i])
+        )
+        total += normal[k] ** 2
+    for k in range(3):
+        normal[k] /= max(math.sqrt(total), 1e-300)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lay_out(xyz: Array, faces: NDArray[np.int32], centers: Array, normals: Array) -> None:
     for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        for k in range(3):
-            centers[f, k] = (xyz[a, k] + xyz[b, k] + xyz[c, k]) / 3.0
-        total = 0.0
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            normals[f, k] = 0.5 * (
-                (xyz[b, i] - xyz[a, i]) * (xyz[c, j] - xyz[a, j]) - (xyz[b, j] - xyz[a, j]) * (xyz[c, i] - xyz[a, i])
-            )
-            total += normals[f, k] ** 2
-        areas[f] = math.sqrt(total)
-        for k in range(3):
-            normals[f, k] /= max(areas[f], 1e-300)
+        _lay_out_face(xyz, faces[f, 0], faces[f, 1], faces[f, 2], centers[f], normals[f])
 
 
 @numba.njit(cache=True, nogil=True)
 def _mark_seen(
-    row: Array, center: Array, centers: Array, normals: Array, depth: NDArray[np.float32], hidden: float,
+    row: Array, place: Array, xyz: Array, faces: NDArray[np.int32], depth: NDArray[np.float32], hidden: float,
     is_seen: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Mark triangles that a view shows from in front, no farther behind what it shows than ``hidden``."""
     height, width = depth.shape
-    for f in range(centers.shape[0]):
+    center, normal = np.empty(3), np.empty(3)
+    for f in range(faces.shape[0]):
         if is_seen[f]:
             continue
-        x, y, z = centers[f, 0], centers[f, 1], centers[f, 2]
-        dx, dy, dz = center[0] - x, center[1] - y, center[2] - z
-        along = dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2]
+        _lay_out_face(xyz, faces[f, 0], faces[f, 1], faces[f, 2], center, normal)
+        dx, dy, dz = place[0] - center[0], place[1] - center[1], place[2] - center[2]
+        along = dx * normal[0] + dy * normal[1] + dz * normal[2]
         if along <= _SMALLEST_COSINE * math.sqrt(dx * dx + dy * dy + dz * dz):
             continue
-        u, v, ahead = project_point(row, x, y, z)
+        u, v, ahead = project_point(row, center[0], center[1], center[2])
         if ahead > 0.0 and u >= 0.0 and v >= 0.0 and u < width and v < height:
             is_seen[f] = ahead <= depth[int(v), int(u)] + np.float32(hidden)
 
@@ -193,13 +202,14 @@ def find_known(
         seen = SeenFaces(mesh)
         for view in views:
             seen.add(view, show_mesh(view, mesh.xyz, mesh.faces).depth)
+    centers, normals = seen.lay_out()
     kind = np.full(len(mesh.faces), OUTLINES, np.int8)
     if evidence is not None:
-        kind[np.abs(evidence.hull.distance(seen.centers, threads)) > _ON_HULL_EDGES * seen.edge] = CLOSURE
+        kind[np.abs(evidence.hull.distance(centers, threads)) > _ON_HULL_EDGES * seen.edge] = CLOSURE
     kind[~seen.is_seen] = UNSEEN
     if evidence is not None:
-        kind[_beside_patches(seen.centers, evidence, band)] = PATCHES
-    return Known(kind, seen.centers, seen.normals, seen.areas)
+        kind[_beside_patches(centers, evidence, band)] = PATCHES
+    return Known(kind, centers, normals, seen.areas)
 
 
 def _beside_patches(centers: Array, evidence: Evidence, band: float) -> NDArray[np.bool_]:

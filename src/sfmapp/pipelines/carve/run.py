@@ -110,6 +110,7 @@ def carve(
         with job.stage("views"):
             source = find_views(what.source, what.images, what.poses, job.options, job.events)
         job.note_inputs({record.name: record.digest for record in source.records})
+        silhouettes: Sequence[Silhouette]
         with job.stage("masks"):
             silhouettes, masks = find_silhouettes(
                 ImageSet(source.records, ()),
@@ -126,6 +127,7 @@ def carve(
             with job.stage("tolerance"):
                 silhouettes, tolerance = doubt_holes(source.views, silhouettes, *box.cube(), job.events)
         solid = find_solid(job, source, silhouettes, box, lights=what.lights, patches=patches, by_colors=what.by_colors)
+        silhouettes = solid.hull.silhouettes  # of many photographs they are most of the memory
         mesh = _surface(job, solid)
         with job.stage("colors"):
             mesh, colors, looks = _colored(job, source, silhouettes, mesh, solid.octree.cell)
