@@ -35,6 +35,7 @@ class FrameRecord:
         covariance: (6, 6) of the pose given the map, as of ``refine_pose``; NaN where it was not measured.
         point_id: (N,) int32 and xy: (N, 2) float32, the points that its pose was measured with.
         cpu_s: CPU seconds of tracking, without the back end.
+        is_twin: it shows what the frame before it shows, and has the pose of that one.
     """
 
     frame_idx: int
@@ -52,6 +53,7 @@ class FrameRecord:
     point_id: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     xy: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     cpu_s: float = 0.0
+    is_twin: bool = False
 
     @property
     def has_pose(self) -> bool:
@@ -72,6 +74,12 @@ class FrameRecord:
     def see(self, point_id: NDArray[np.integer], xy: Array) -> None:
         """Note the points (N,) that the pose was measured with, and the pixels (N, 2) at which they were seen."""
         self.point_id, self.xy = point_id.astype(np.int32), xy.astype(np.float32)
+
+    def be_twin_of(self, before: FrameRecord) -> None:
+        """Have seen what the frame before has seen, the same arrays where that is no keyframe."""
+        self.is_twin = True
+        if len(before.xy):
+            self.point_id, self.xy = before.point_id, before.xy
 
     def measure(self, covariance: Array, frame_from_keyframe: Array) -> None:
         """Note how well the points hold the pose; a frame that is no keyframe takes the pose as well."""
@@ -119,10 +127,14 @@ def leave_keyframe(
 def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int) -> None:
     """Poses of the frames between the keyframes of a map, from the points as they are in the end, and how well these
     hold them. Keyframes stay where the adjustment has put them."""
-    camera = keyframes.rig.cameras[0]
+    camera, last = keyframes.rig.cameras[0], None
     for record in records:
         if record.map_idx != map_idx or not record.has_pose:
             continue
+        if last is not None and record.is_twin and record.xy is last.xy and record.keyframe == last.keyframe:
+            record.measure(last.covariance, last.frame_from_keyframe)
+            continue
+        last = record
         keyframe = keyframes.keyframes[record.keyframe]
         point_id, xy = record.point_id.astype(np.int64), record.xy.astype(np.float64)
         if record.is_keyframe:

@@ -69,7 +69,8 @@ class OdometryReport(Report):
     Attributes:
         num_keyframes: of each map.
         tracking_cpu_s, backend_cpu_s: CPU seconds of tracking and of local adjustment.
-        looked_still, looked_turned: frames in which the camera seemed to stand still, or to turn on the spot.
+        looked_still, looked_turned: frames in which the camera seemed to stand still, or to turn on the spot, before
+            there was a map. twins: frames of a map that showed what the one before showed.
         right_late_frames: by how many frames the images of the second camera came late.
         pairs: what contradicts that the images of the two cameras are of the same moments.
         known_map: of the map that was there before; absent without one.
@@ -87,6 +88,7 @@ class OdometryReport(Report):
     keyframes_culled: int
     looked_still: int
     looked_turned: int
+    twins: int
     right_late_frames: int
     pairs: Sequence[Contradiction]
     known_map: KnownMapReport | None = None

@@ -18,6 +18,7 @@ from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks
 from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
+from sfmapp.odometry.frontend.twins import is_twin
 from sfmapp.odometry.inertial.markers import MarkerDetector
 from sfmapp.odometry.inertial.smoothing import smooth_trajectory
 from sfmapp.odometry.initialize import MapInitializer, TwoViews
@@ -36,7 +37,7 @@ from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.report import OdometryReport, ShutterReport
-from sfmapp.odometry.residual_memory import ResidualMemory
+from sfmapp.odometry.residual_memory import Correlation, ResidualMemory
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -62,6 +63,7 @@ class _Tracked:
         num_mapped_at_keyframe: how many were mapped when the newest keyframe was made.
         covariance: (6, 6) of the pose given the map; not finite where it was not measured.
         map_moved: (7,) see :class:`~sfmapp.odometry.snapshot.FrameSnapshot`, since the last frame was told of.
+        residual_px: standard deviation of the points that measured it, a coordinate.
     """
 
     pose: Array = field(default_factory=rigid3.IDENTITY.copy)
@@ -71,6 +73,7 @@ class _Tracked:
     num_mapped_at_keyframe: int = 0
     covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     map_moved: Array = field(default_factory=rigid3.IDENTITY.copy)
+    residual_px: float = 0.0
 
     def drop_tracks(self) -> None:
         """Nothing is followed any more."""
@@ -87,6 +90,7 @@ class _Counts:
     keyframes_culled: int = 0
     looked_still: int = 0
     looked_turned: int = 0
+    twins: int = 0
 
 
 class Odometry:
@@ -154,7 +158,8 @@ class Odometry:
         record = FrameRecord(frame.idx, frame.name, frame.timestamp_s)
         self.records.append(record)
         self._go_through_phases(record, view)
-        self.tracked.previous = view.pyramids[0]
+        if not record.is_twin:  # later ones are compared with the frame that was measured: what is small may add up
+            self.tracked.previous = view.pyramids[0]
         record.cpu_s = time.thread_time() - start
         if record.is_keyframe:
             self.keyframe_images.look(frame.idx, frame.images[0])
@@ -268,6 +273,8 @@ class Odometry:
         assert local is not None
         assert tracked.previous is not None
         self._take_over(local, len(self.records))
+        if self._repeat(record, view):
+            return True
         step = self.motion.predict([r.timestamp_s for r in self.records[-3:]])
         found = track(local, tracked.tracks, tracked.pose, step, tracked.previous, view.pyramids[0])
         if found is None:
@@ -275,15 +282,37 @@ class Odometry:
         self.motion.learn(rigid3.compose(found.pose, rigid3.inverse(tracked.pose)))
         tracked.pose, tracked.tracks, tracked.is_mapped = found.pose, found.tracks, found.is_mapped
         tracked.covariance = record.live_covariance = found.covariance
-        point_id, xy = found.tracks.point_id[found.is_mapped], found.tracks.xy[found.is_mapped]
-        seen = project(local.camera, rigid3.apply(found.pose, local.keyframes.point_xyz[point_id]))
-        record.correlation = self.residuals.look(point_id, xy - seen)
+        record.correlation = self._compare_residuals(local)
+        tracked.residual_px = found.residual_px
         local.witnesses.followed(view.frame_idx, found.num_followed, len(found.tracks))
         reason = keyframe_reason(local, found, tracked.num_mapped_at_keyframe, self.options)
         if reason is None:
             self._settle(record, FrameState.TRACKED, found.pose, tracks=found.tracks.subset(found.is_mapped))
         else:
             self._make_keyframe(record, view, FrameState.TRACKED, reason)
+        return True
+
+    def _compare_residuals(self, local: LocalMap) -> Correlation:
+        """Of the frame whose pose has been measured, with those of the frames before it."""
+        seen = self.tracked.tracks.subset(self.tracked.is_mapped)
+        expected = project(local.camera, rigid3.apply(self.tracked.pose, local.keyframes.point_xyz[seen.point_id]))
+        return self.residuals.look(seen.point_id, seen.xy - expected)
+
+    def _repeat(self, record: FrameRecord, view: View) -> bool:
+        """Give a frame that shows what the last one shows the pose of that one, if it is so."""
+        local, tracked, last = self.local, self.tracked, self.records[-2]
+        assert local is not None
+        seen = tracked.tracks.subset(tracked.is_mapped)
+        if last.state is not FrameState.TRACKED or tracked.previous is None or not len(seen):
+            return False
+        together_px = tracked.residual_px * math.sqrt(3.0 / len(seen))  # six numbers of 2 N coordinates
+        if not is_twin(tracked.previous, view.pyramids[0], seen.xy, tracked.residual_px, together_px):
+            return False
+        self._settle(record, FrameState.TRACKED, tracked.pose, tracks=seen)
+        record.be_twin_of(last)
+        record.live_covariance, record.correlation = last.live_covariance, self._compare_residuals(local)
+        self.motion.stop()
+        self.counts.twins += 1
         return True
 
     def _make_keyframe(self, record: FrameRecord, view: View, state: FrameState, reason: str) -> None:

@@ -40,6 +40,7 @@ MODULES = (
 PAIR_MODULES = MODULES[:2]
 ODOMETRY_MODULES = (
     "sfmapp.odometry.frontend.small_image",
+    "sfmapp.odometry.frontend.twins",
     "sfmapp.odometry.frontend.corners",
     "sfmapp.odometry.frontend.alignment",
     "sfmapp.odometry.frontend.epipolar_search",
