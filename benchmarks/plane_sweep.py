@@ -198,22 +198,24 @@ class SweptScene:
             self._swept[view] = found, time.process_time() - start
         return self._swept[view]
 
-    def both_of(self, view: int) -> list[tuple[str, SweptDepth, float]]:
-        """The map of a view alone, and after its neighbours' were asked, and the CPU seconds of each: those of the
-        second without those of other views' maps."""
+    def alone(self, view: int) -> tuple[SweptDepth, float]:
+        """The map of a view alone, and the CPU seconds that it took."""
+        planes, cpu_s = self.planes_of(view)
+        start = time.process_time()
+        found = measured(self.scene, view, planes)
+        return found, cpu_s + time.process_time() - start
+
+    def answered(self, view: int) -> tuple[SweptDepth, float]:
+        """After its neighbours' were asked; the CPU seconds are without those of other views' maps."""
         own, cpu_s = self.planes_of(view)
         told = {m: self.planes_of(m)[0] for m in (view, *own.neighbors)}
-        out = []
-        for which in ("alone", "answered"):
-            start = time.process_time()
-            planes = own if which == "alone" else exchange_planes(self.scene, view, told)
-            found = measured(self.scene, view, planes)
-            out.append((which, found, cpu_s + time.process_time() - start))
-        return out
+        start = time.process_time()
+        found = measured(self.scene, view, exchange_planes(self.scene, view, told))
+        return found, cpu_s + time.process_time() - start
 
-    def map_of(self, view: int) -> SweptDepth:
-        """After its neighbours' were asked."""
-        return self.both_of(view)[1][1]
+    def both_of(self, view: int) -> list[tuple[str, SweptDepth, float]]:
+        """What both are called, and both."""
+        return [("alone", *self.alone(view)), ("answered", *self.answered(view))]
 
 
 def scores_of(case: str, swept: SweptScene, view: int, truth: Truth) -> list[Score]:
@@ -221,7 +223,7 @@ def scores_of(case: str, swept: SweptScene, view: int, truth: Truth) -> list[Sco
     maps = swept.both_of(view)
     _, own, cpu_s = maps[-1]
     scene = swept.scene
-    others = [(scene.views[m], swept.both_of(m)[0][1]) for m in own.neighbors]
+    others = [(scene.views[m], swept.alone(m)[0]) for m in own.neighbors]
     agree, against = confirm(scene.views[view], own, others)
     kept = (agree > 0) & (agree >= against)
     maps.append(("confirmed", replace(own, depth=np.where(kept, own.depth, np.float32(np.nan))), cpu_s))

@@ -44,7 +44,7 @@ class SweptSample:
 
 
 def sample_of(swept: SweptScene, view: int, depth: Map) -> SweptSample:
-    scene, found = swept.scene, swept.map_of(view)
+    scene, (found, _) = swept.scene, swept.answered(view)
     chosen = np.flatnonzero(np.isfinite(found.plane) & np.isfinite(depth))
     chosen = np.random.default_rng(0).choice(chosen, PIXELS, replace=False)
     others = [scene.views[m] for m in found.neighbors]
