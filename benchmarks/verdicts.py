@@ -667,6 +667,13 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "another place, or one that looks the same, is not taken for one of a known map"
     good = [not row["known_map"].get("is_found") for row in outside]
     yield Promise("known_maps", text, sum(good), len(outside), date)
+    report = read(folder, "kidnapped")
+    rows, date = [row for hall in report["halls"] for row in hall["rows"]], report["date"][:10]
+    text = "a camera put down in a hall of look-alikes is where it is believed to be, or undecided; never surely wrong"
+    yield Promise("kidnapped", text, sum(row["outcome"] != "surely wrong" for row in rows), len(rows), date)
+    text = "put down before the corner that has no like it knows its place within 60 frames"
+    before = [row["outcome"] == "right" for row in rows if row["kind"] == "towards the corner"]
+    yield Promise("kidnapped", text, sum(before), len(before), date)
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
