@@ -633,6 +633,17 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "live, the last third of a run holds at most 20 MB more than the second"
     flat = [run["memory_mb"][2] - run["memory_mb"][1] <= 20.0 for run in live]
     yield Promise("live", text, sum(flat), len(flat), report["date"][:10])
+    report = read(folder, "filtering")
+    flown = [run for run in report["runs"] if "filter" in run]
+    text = "live poses filtered with an IMU: NIS of a flight within its 95 % bounds"
+    told = [run["filter"]["bounds"][0] <= run["filter"]["nis"] <= run["filter"]["bounds"][1] for run in flown]
+    yield Promise("filtering", text, sum(told), len(told), report["date"][:10])
+    text = "live poses filtered with an IMU: NEES of a flight below 2"
+    stated = [run["filter"]["nees"] < 2.0 for run in flown]
+    yield Promise("filtering", text, sum(stated), len(stated), report["date"][:10])
+    text = "at the end of gaps of 0.5 to 3 s each of six errors is within three stated sigmas"
+    bridged = [max(map(abs, gap["sigmas"])) < 3.0 for run in flown for gap in run["gaps"]]
+    yield Promise("filtering", text, sum(bridged), len(bridged), report["date"][:10])
     report = read(folder, "wheeled")
     pairs = [(run["free"], run[motion]) for run in report["runs"] for motion in ("planar", "ackermann")]
     text = "on wheels planar motion gives no fewer frames a pose than free motion"

@@ -14,8 +14,8 @@ import sfmapp
 from odometry_sequences import PINHOLE, room
 from schemas import check_schema
 from sfmapp.cli.main import main
-from sfmapp.events import Events
-from sfmapp.images import video
+from sfmapp.events import Event, Events
+from sfmapp.images import live_buffer, video
 from sfmapp.images.addresses import without_credentials
 from sfmapp.images.frame_reader import Skipped
 from sfmapp.images.live_buffer import LiveBuffer, read_newest, taken_from
@@ -117,19 +117,27 @@ def test_a_reader_is_read_on_beside_and_closed_there() -> None:
         list(read_newest(Reader([sfmapp.InputError("no camera")]), LiveBuffer(), lambda: True, 5.0))
 
 
-def test_a_wish_to_stop_ends_a_source_that_gives_nothing() -> None:
-    hang, events, buffer = threading.Event(), Events(), LiveBuffer()
+def test_a_wish_to_stop_ends_a_source_that_gives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    hang, events, buffer, asked = threading.Event(), Events(), LiveBuffer(), []
 
     class Hanging(Reader):
         def __call__(self) -> Frame | Skipped | None:
             hang.wait()
             return None
 
-    threading.Timer(0.2, events.cancel).start()
+    def is_wanted() -> bool:
+        asked.append(events.is_cancelled)
+        if len(asked) == 2:
+            events.cancel()
+        return not events.is_cancelled
+
+    monkeypatch.setattr(live_buffer, "_END_S", 0.0)  # it is left behind
     reader = Hanging([])
-    threading.Timer(0.4, hang.set).start()
-    assert list(read_newest(reader, buffer, lambda: not events.is_cancelled, 60.0)) == []
+    assert list(read_newest(reader, buffer, is_wanted, 60.0)) == []
     assert buffer.counts.end == "stopped on request"
+    assert not reader.is_closed.is_set()
+    hang.set()
+    assert reader.is_closed.wait(60.0)  # closed by its own thread
 
 
 class FakeCapture:
@@ -221,6 +229,8 @@ def test_what_is_pushed_is_tracked_as_it_would_be_from_a_list(tmp_path: Path) ->
     assert report is not None
     assert report["live"]["num_arrived"] == report["live"]["num_tracked"] == 30
     assert report["live"]["end"] == "closed"
+    (check,) = (row for row in report["checks"] if row["name"] == "frames that were tracked in time")
+    assert (check["value"], check["light"]) == ("100.0 %", "green")
     assert 0 < report["live"]["latency_ms"]["median"] <= report["live"]["latency_ms"]["max"]
     check_schema("odometry", json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8")))
     assert "30 frames came, 0 of them were dropped" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -257,6 +267,44 @@ def test_a_program_that_fails_or_a_callback_that_does(tmp_path: Path) -> None:
         sfmapp.LiveOdometry(PINHOLE).close()
     with pytest.raises(sfmapp.UsageError):
         sfmapp.LiveOdometry(PINHOLE, Path(__file__).parent)
+
+
+def test_a_stop_is_how_a_live_run_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images = [images[0] for images in room(30).images]
+
+    tracked = [0]
+
+    class Walking(FakeCapture):
+        """The walk through the room, as quickly as it is tracked, so that nothing is dropped."""
+
+        def get(self, key: int) -> float:
+            return {3: float(PINHOLE.width), 4: float(PINHOLE.height)}.get(key, 30.0)
+
+        def grab(self) -> bool:
+            while self.count > tracked[0]:
+                threading.Event().wait(0.002)
+            self.count += 1
+            return self.count <= len(images)
+
+        def retrieve(self) -> tuple[bool, np.ndarray]:
+            return True, np.repeat(images[self.count - 1][..., None], 3, 2)
+
+    def follow(event: Event) -> None:
+        if event.stage == "odometry" and event.kind == "advanced":
+            tracked[0] = event.done
+            if event.done == 25:
+                events.cancel()
+
+    monkeypatch.setattr("cv2.VideoCapture", Walking)
+    events = Events(follow)
+    camera = f"sequence.camera=PINHOLE,{','.join(str(value) for value in PINHOLE.params)}"
+    options = sfmapp.load_options(settings=[camera])
+    _, report = sfmapp.track_sequence("camera:0", tmp_path / "out", options, record=False, events=events)
+    assert report is not None
+    assert report["outcome"]["exit_code"] == 0
+    assert report["live"]["end"] == "stopped on request"
+    assert (report["live"]["num_tracked"], report["live"]["num_dropped"]) == (25, 0)
+    assert (tmp_path / "out" / "sparse" / "0").is_dir()
 
 
 # ---------------------------------------------------------------------------------------------------- addresses

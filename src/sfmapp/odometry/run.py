@@ -37,7 +37,7 @@ from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure
 from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.report import OdometryReport, ShutterReport
-from sfmapp.odometry.residual_memory import Correlation, ResidualMemory
+from sfmapp.odometry.residual_memory import NOT_KNOWN, Correlation, ResidualMemory
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.shutter import straighten
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
@@ -293,7 +293,9 @@ class Odometry:
         return True
 
     def _compare_residuals(self, local: LocalMap) -> Correlation:
-        """Of the frame whose pose has been measured, with those of the frames before it."""
+        """Of the frame whose pose has been measured, with those of the frames before it, if a filter wants to know."""
+        if not self.options.filter:
+            return NOT_KNOWN
         seen = self.tracked.tracks.subset(self.tracked.is_mapped)
         expected = project(local.camera, rigid3.apply(self.tracked.pose, local.keyframes.point_xyz[seen.point_id]))
         return self.residuals.look(seen.point_id, seen.xy - expected)

@@ -50,7 +50,7 @@ class FrameSnapshot:
             ``x_cam <- exp(w) x_cam + v``; NaN where it was not measured.
         map_moved: (7,) how adjustments have moved the map below the camera since the frame before: a place x of now was
             at map_moved(x).
-        correlation: how far the frame's residuals are those of the frames before it.
+        correlation: how far the frame's residuals are those of the frames before it; NaN where nobody filters.
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
         cpu_s: CPU seconds of tracking, back end not included.
         latency_s: of a live source, seconds from when the frame came until its pose was known; NaN of recorded ones.
