@@ -11,6 +11,7 @@ import numpy as np
 
 from sfmapp.carve.backgrounds import ColorModel, Mask, Pixels, learn_colors, object_mask, without_specks
 from sfmapp.carve.graph_cut import cut_by_mask, shrunk_picture
+from sfmapp.carve.smooth_backgrounds import cut_from_smooth
 from sfmapp.carve.still_backgrounds import StillBackground, cut_from_background, learn_background
 from sfmapp.carve.still_cameras import still_groups
 from sfmapp.errors import InputError
@@ -58,7 +59,11 @@ class Background:
             cuts = (cut_from_background(picture, scene) for scene in self.still)
             return next((cut for cut in cuts if cut is not None), None)
         mask = object_mask(picture, self.colors)
-        return without_specks(cut_by_mask(picture, mask)) if self.colors.error > _TELLING else mask
+        if self.colors.error <= _TELLING:
+            return mask
+        cut = without_specks(cut_by_mask(picture, mask))
+        # before what is dark shadows on the object fit as well
+        return cut if self.colors.is_dark or self.colors.error <= _PLAIN else cut_from_smooth(picture, cut)
 
 
 def spread(records: Sequence[ImageRecord], num: int) -> list[ImageRecord]:

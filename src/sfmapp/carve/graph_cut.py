@@ -11,7 +11,7 @@ Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 # longer side of what is cut, pixels: it decides what belongs together, edges are refined in the full picture
-_LONGEST = 320
+_LONGEST = 400
 _ROUNDS = 3
 # around a mask, of the longer side, the object may go on; twice as much beyond that tells the background
 _PAD = 0.06

@@ -118,8 +118,13 @@ def _sweep(pieces: NDArray[np.float32], nearest: NDArray[np.int32], square: NDAr
             before = y - 1 if down == 0 else y + 1
             if 0 <= before < height:
                 for x in range(width):
+                    # neighbours mostly have one piece in common, which is not asked twice
+                    asked = nearest[y, x]
                     for n in range(max(x - 1, 0), min(x + 2, width)):
-                        _relax(pieces, nearest, square, y, x, nearest[before, n])
+                        k = nearest[before, n]
+                        if k != asked:
+                            _relax(pieces, nearest, square, y, x, k)
+                            asked = k
             for x in range(1, width):
                 _relax(pieces, nearest, square, y, x, nearest[y, x - 1])
             for x in range(width - 2, -1, -1):

@@ -22,6 +22,7 @@ from sfmapp.carve.consistency import compare
 from sfmapp.carve.graph_cut import cut_by_rectangle
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
 from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
+from sfmapp.carve.smooth_backgrounds import cut_from_smooth
 from sfmapp.carve.views import View, project_points
 from sfmapp.errors import InputError, UsageError, listed
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
@@ -225,8 +226,8 @@ def _find(
         return None if alpha is None else _Found(_coverage(alpha), "alpha")
     picture = read_rgb(record)
     if source == "grabcut":
-        coverage = refined_coverage(picture, without_specks(cut_by_rectangle(picture, rectangle)))
-        return _Found(coverage, "grabcut")
+        mask = cut_from_smooth(picture, without_specks(cut_by_rectangle(picture, rectangle)))
+        return _Found(refined_coverage(picture, mask), "grabcut")
     assert background is not None
     cut = background.cut(picture)
     return None if cut is None else _Found(refined_coverage(picture, cut), background.source)
