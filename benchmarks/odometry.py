@@ -4,7 +4,8 @@ asked.
     python benchmarks/odometry.py                     # kitti00-200 forward, in steps of two, backwards; rendered ones
     python benchmarks/odometry.py --rendered 0 --peer # real data alone, and pycolmap on every second frame (minutes)
     python benchmarks/odometry.py FOLDER ...          # sequences with a ground truth: KITTI, TUM, EuRoC
-    python benchmarks/odometry.py --kitti DIR --euroc DIR --tum DIR   # all that are there, in the tables of papers
+    python benchmarks/odometry.py --kitti DIR --euroc DIR --tum DIR   # all that are there, in the tables of papers,
+                                                      # and ORB-SLAM3 beside, where it is: see orb_slam3.py
 
 The command runs as a process of its own with its default options, without a recording; wall seconds, CPU seconds (user
 and system, children included) and peak resident memory are those of the process, its start and its imports included.
@@ -25,18 +26,29 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from machine import RESULTS, ROOT, describe_machine
+from orb_slam3 import vocabulary
 from published_sequences import find_published, published_tables
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
-from sfmapp.evaluation.trajectory import Trajectory, absolute_error, associate, kitti_drift, statistics
+from sfmapp.evaluation.trajectory import (
+    KITTI_LENGTHS_M,
+    Trajectory,
+    absolute_error,
+    associate,
+    kitti_drift,
+    path_shares_m,
+    statistics,
+)
 from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
+from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import GroundTruth
 from sfmapp.pipelines.evaluate import evaluate
 from sfmapp.sequences.open import SequenceOptions, open_sequence
 
@@ -132,7 +144,7 @@ def ground_truth_numbers(out: Path, case: Case) -> dict[str, Any]:
     return {
         "ground_truth": {
             "alignment": "se3" if unit == "m" else "sim3",
-            "ate_m": ate,
+            "ate_m": dict(ate),
             "ate_percent": 100 * ate["rmse"] / result.pairs.ground_truth.path_m,
             "scale": errors.absolute.scale,
             "path_m": result.pairs.ground_truth.path_m,
@@ -172,20 +184,42 @@ def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]
     model = read_model(opinion.model_folder)[0]
     pose_of = dict(zip(model.image_names, model.cam_from_world, strict=True))
     poses = np.array([pose_of.get(name, np.full(7, np.nan)) for name in names])
-    pairs = associate(
-        Trajectory.from_cam_from_world(poses, [time for _, time in frames]),
-        Trajectory.from_cam_from_world(ground_truth.cam_from_world, ground_truth.timestamps_s),
+    trajectory = Trajectory.from_cam_from_world(poses, [time for _, time in frames])
+    return values | {"ground_truth": against(trajectory, ground_truth, "sim3")}
+
+
+def run_orb_slam3(case: Case, work: Path) -> dict[str, Any]:
+    """ORB-SLAM3, its start and the loading of its vocabulary included; with a scale of its own for one camera."""
+    out, is_mono = work / "orb_slam3.txt", "--mono" in case.flags
+    command = [sys.executable, str(ROOT / "benchmarks" / "orb_slam3.py"), str(case.sequence), str(out)]
+    usage = run_measured([*command, *(["--mono"] if is_mono else [])], work / "orb_slam3.log")
+    sequence = open_sequence(case.sequence, SequenceOptions(mono=is_mono), Events())
+    count = sequence.num_frames or 0
+    values = asdict(usage) | {"num_frames": count, "num_in_largest_map": 0, "ground_truth": None,
+                              "process_cpu_ms_per_frame": 1e3 * usage.cpu_s / max(count, 1)}  # fmt: skip
+    if usage.exit_code or sequence.ground_truth is None:
+        return values
+    rows = np.loadtxt(out, ndmin=2)
+    poses = rigid3.inverse(np.column_stack([rows[:, 4:], rows[:, 1:4]]))
+    found = against(
+        Trajectory.from_cam_from_world(poses, rows[:, 0]), sequence.ground_truth, "sim3" if is_mono else "se3"
     )
-    error = absolute_error(pairs, "sim3")
-    ate = statistics(error.translation_m)
+    return values | {"num_with_pose": len(rows), "num_in_largest_map": len(rows), "ground_truth": found}
+
+
+def against(trajectory: Trajectory, ground_truth: GroundTruth, alignment: Literal["se3", "sim3"]) -> dict[str, Any]:
+    """What ``ground_truth_numbers`` has, of another program's trajectory."""
+    pairs = associate(
+        trajectory, Trajectory.from_cam_from_world(ground_truth.cam_from_world, ground_truth.timestamps_s)
+    )
+    error, path = absolute_error(pairs, alignment), pairs.ground_truth.path_m
+    ate, lengths_m = statistics(error.translation_m), KITTI_LENGTHS_M
     assert ate is not None
-    drift = kitti_drift(pairs, scale=error.scale)
-    path = pairs.ground_truth.path_m
-    values["ground_truth"] = {"alignment": "sim3", "ate_m": ate, "ate_percent": 100 * ate["rmse"] / path,
-                       "path_m": path,
-                       "scale": error.scale, "coverage": pairs.coverage, "drift_percent": drift.t_rel_percent,
-                       "drift_deg_per_100m": 100 * drift.r_rel_deg_per_m, "is_kitti_drift": True}  # fmt: skip
-    return values
+    is_long = path > lengths_m[0]
+    drift = kitti_drift(pairs, scale=error.scale, lengths_m=lengths_m if is_long else path_shares_m(pairs))
+    return {"alignment": alignment, "ate_m": dict(ate), "ate_percent": 100 * ate["rmse"] / path, "path_m": path,
+            "scale": error.scale, "coverage": pairs.coverage, "drift_percent": drift.t_rel_percent,
+            "drift_deg_per_100m": 100 * drift.r_rel_deg_per_m, "is_kitti_drift": is_long}  # fmt: skip
 
 
 def measure(cases: Sequence[Case], args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -200,6 +234,11 @@ def measure(cases: Sequence[Case], args: argparse.Namespace) -> Iterator[dict[st
             with tempfile.TemporaryDirectory(dir=args.work) as work:
                 run = run_sfmapp(case, Path(work) / "out", args)
             yield {"case": case.name, "program": "sfmapp", "repeat": repeat, "load_before": load} | run
+        if args.published and vocabulary() is not None and "imu" not in case.flags:
+            load = os.getloadavg()[0]
+            with tempfile.TemporaryDirectory(dir=args.work) as work:
+                run = run_orb_slam3(case, Path(work))
+            yield {"case": case.name, "program": "ORB-SLAM3", "repeat": 0, "load_before": load} | run
         if args.peer and not case.flags:
             load = os.getloadavg()[0]
             with tempfile.TemporaryDirectory(dir=args.work) as work:
@@ -266,7 +305,9 @@ def markdown(report: dict[str, Any]) -> str:
             drift += " *"
         speed = row["num_frames"] / row["wall_s"] if row["num_frames"] and row["wall_s"] else None
         same = {True: "yes", False: "NO", None: "-"}[row["same_bytes"]]
-        name = row["case"] + ("" if row["program"] == "sfmapp" else f", {row['program']} on every second frame")
+        name = row["case"] + {"sfmapp": "", "pycolmap": ", pycolmap on every second frame"}.get(
+            row["program"], f", {row['program']}"
+        )
         frames = f"{row['num_in_largest_map']} of {row['num_frames']}"
         if row["num_failed"]:
             frames += f" ({row['num_failed']} runs FAILED)"

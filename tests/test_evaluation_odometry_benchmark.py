@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
+
+from sfmapp.evaluation.trajectory import Trajectory
+from sfmapp.geometry import rigid3
+from sfmapp.images.sequence import GroundTruth
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "odometry.py"
 
@@ -72,3 +78,16 @@ def test_the_digest_is_of_results_not_of_times(odometry: ModuleType, tmp_path: P
     assert odometry.digest(tmp_path) == first
     (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"3")
     assert odometry.digest(tmp_path) != first
+
+
+def test_errors_of_another_programs_trajectory_can_be_written(odometry: ModuleType) -> None:
+    times, rng = np.arange(40) * 0.1, np.random.default_rng(0)
+    centers = np.cumsum(rng.normal(0, 4.0, (40, 3)), axis=0)
+    poses = rigid3.from_matrix(np.tile(np.eye(3), (40, 1, 1)), -centers)
+    other = poses.copy()
+    other[:, 4:] /= 2.0  # a unit of its own
+    found = odometry.against(Trajectory.from_cam_from_world(other, times), GroundTruth(times, poses), "sim3")
+    assert json.loads(json.dumps(found))["ate_m"]["rmse"] == pytest.approx(0.0, abs=1e-9)
+    assert found["scale"] == pytest.approx(2.0)
+    assert found["is_kitti_drift"]
+    assert found["drift_percent"] == pytest.approx(0.0, abs=1e-9)
