@@ -388,7 +388,7 @@ def carving_rows(folder: Path) -> Iterator[Row]:
             if peer != "sfmapp":
                 yield Row("carving", case, what, unit, "less", figures["sfmapp"], peer, value, *about)
     for run in report["dinosaur"]:
-        case = f"dinosaur, {run['cells']} cells, {'whole' if 'triangles' in run else 'octree'}"
+        case = f"dinosaur, {run['cells']} cells, whole"
         yield Row("carving", case, "CPU time", "s", "less", run["cpu_s"], "", None, *about)
         yield Row("carving", case, "peak memory", "MB", "less", run["peak_mb"], "", None, *about)
     for run in report["bunny"]["runs"]:
