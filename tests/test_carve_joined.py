@@ -227,7 +227,7 @@ def test_the_step_towards_votes_is_the_least_of_its_energy() -> None:
     num, weight, step = 200, 0.7, 0.28
     votes = rng.integers(0, 4, (num, BINS)).astype(np.uint8)
     votes[:20] = 0
-    extra = rng.choice([-0.5, 0.0, 2.5], num).astype(np.float32)
+    extra = rng.choice([0.0, 2.5], num).astype(np.float32)
     start = rng.uniform(-1.0, 1.0, num).astype(np.float32)
     value, before = start.copy(), start.copy()
     none = np.full((num, 3), FULL, np.int32)
@@ -236,8 +236,7 @@ def test_the_step_towards_votes_is_the_least_of_its_energy() -> None:
     centers = np.concatenate([[-1.0], -1.0 + (2.0 * np.arange(1, BINS - 1) - 1.0) / (BINS - 2), [1.0]])
     grid = np.linspace(-1.0, 1.0, 4001)
     pulls = votes.astype(float)
-    pulls[:, -1] += np.maximum(extra, 0.0)
-    pulls[:, 0] += np.maximum(-extra, 0.0)
+    pulls[:, -1] += extra
     energy = (grid[:, None] - start) ** 2 / (2.0 * step)
     for b in range(BINS):
         energy += weight * pulls[:, b] * np.abs(grid[:, None] - centers[b])

@@ -53,16 +53,8 @@ _WHOLE = 5
 _BAND_PX, _BAND_CELLS = 2.0, 2.0
 # steps of Chambolle and Pock (2011): their product times the squared norm of the slope, 12 at most, stays below 1
 _STEP = 0.28
-# Iterations by level: the two coarsest have the large areas to move, a fine one only what a cell of the coarser one is.
-# Once something was put back for a silhouette, what is around it moves: a quarter of them.
-_COARSE_ITERATIONS, _ITERATIONS, _FEWEST_ITERATIONS = 1280, 320, 40
-# What nothing tells leans to empty, or the hull would stay below what stands on a table: the least surface there is
-# hardly less than the hull's, and would take thousands of iterations. A node costs so much over the cells along the
-# side of the cube; from 6 on it would pay to hollow out a full cube.
-_LEAN = 3.0
-# What the wider band of the coarser level alone said to be full costs so much a node: a gap as wide as such a band,
-# four nodes, saves less than half of what its two surfaces cost, so that nothing is hollowed out by it.
-_RETREAT = 0.2
+# iterations by level: a coarse level has the large areas to move, a fine one only what a cell of the coarser one is
+_ITERATIONS, _FEWEST_ITERATIONS = 320, 40
 # how often what is left is held to the silhouettes at each level: what is put back may lay bare what lies behind
 _ROUNDS = 3
 # a pixel is uncovered so far inside its outline, in pixels beside the width of a cell
@@ -125,10 +117,8 @@ def _find(codes: Codes, places: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @dataclass
 class _Level:
-    """Nodes (N) of the lattice of a level, of so many cells along the side: places, their sorted codes, and what is
-    known of them. ``extra``: votes for full, or for empty if negative."""
+    """Nodes (N) of the lattice of a level: places, their sorted codes, and what is known of them."""
 
-    cells: int
     places: NDArray[np.int64]
     codes: Codes
     xyz: Array
@@ -249,12 +239,11 @@ def join(
             if options.keep > 0.0:
                 _keep(level, evidence, options.keep, cell, pool)
             weight, iterations = options.trust * cell / band, _iterations(number)
-            _lean(level, levels[-1] if number > _WHOLE + 1 else None, weight)
             _solve(level, weight, iterations, events, pool)
             for _ in range(_ROUNDS):
                 if not _fill(level, evidence, cell, pool):
                     break
-                _solve(level, weight, iterations // 4, events, pool)
+                _solve(level, weight, iterations, events, pool)
             if number == depth:
                 _hold_to_outlines(level, band, cell)
             level.flagged = _near_surface(level, cell)
@@ -278,7 +267,7 @@ def join(
 
 
 def _iterations(number: int) -> int:
-    return _COARSE_ITERATIONS if number <= _WHOLE + 1 else max(_FEWEST_ITERATIONS, _ITERATIONS >> number - _WHOLE - 1)
+    return max(_FEWEST_ITERATIONS, _ITERATIONS >> max(0, number - _WHOLE - 1))
 
 
 def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: ThreadPoolExecutor) -> _Level:
@@ -307,7 +296,7 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
 
     in_parts(measure, num, pool)
     level = _Level(
-        size, places, codes, xyz, distance, np.empty((0, BINS), np.uint8), np.zeros(num, np.float32),
+        places, codes, xyz, distance, np.empty((0, BINS), np.uint8), np.zeros(num, np.float32),
         np.ones(num, np.float32), np.empty((num, 3), np.int32), np.empty((num, 3), np.int32), np.zeros(num, np.bool_),
     )  # fmt: skip
     if above is not None:
@@ -315,7 +304,7 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
         other = above.find((places + 1) >> 1)
         at, other = np.where(at >= 0, at, other), np.where(other >= 0, other, at)
         level.value = 0.5 * (above.value[at] + above.value[other])
-        level.extra = np.maximum(np.maximum(above.extra[at], above.extra[other]), np.float32(0.0))
+        level.extra = np.maximum(above.extra[at], above.extra[other])
     beyond = np.where(level.value > 0.0, FULL, EMPTY)
     for axis in range(3):
         step = np.eye(3, dtype=np.int64)[axis]
@@ -370,19 +359,6 @@ def _keep(level: _Level, evidence: Evidence, keep: float, cell: float, pool: Thr
         level.extra[seen] = np.maximum(level.extra[seen], np.float32(keep))
 
     in_parts(run, len(idx), pool)
-
-
-def _lean(level: _Level, above: _Level | None, weight: float) -> None:
-    """Lean what nothing tells to empty: a little where there is no level above, or not one that decides; else where a
-    sight told it there, with its wider band, and no longer does."""
-    idx = np.flatnonzero((level.hull > 0.0) & (level.extra <= 0.0) & ~level.votes.any(axis=1))
-    if above is None:
-        level.extra[idx] = -_LEAN / (level.cells * weight)
-        return
-    was_told = np.asarray(above.votes.any(axis=1))
-    for shift in (0, 1):
-        at = above.find((level.places[idx] + shift) >> 1)
-        level.extra[idx[(at >= 0) & was_told[at]]] = -_RETREAT / weight
 
 
 def _solve(level: _Level, weight: float, iterations: int, events: Events, pool: ThreadPoolExecutor) -> None:

@@ -91,9 +91,9 @@ def find_value(
 ) -> None:  # fmt: skip
     """Primal step: against the divergence of the flow, then to the weighted median of the votes.
 
-    ``prior`` (N, 3) are the neighbours before each node; ``extra`` (N,) votes for full, or for empty if negative. The
-    sum of |value - vote| over the votes and half a square over steps is least at a median of 2 BINS + 1 numbers (Li
-    and Osher, 2009); a walk over the bins finds it.
+    ``prior`` (N, 3) are the neighbours before each node; ``extra`` (N,) votes for full. The sum of |value - vote| over
+    the votes and half a square over steps is least at a median of 2 BINS + 1 numbers (Li and Osher, 2009); a walk over
+    the bins finds it.
     """
     pull = weight * step
     for i in range(first, last):
@@ -102,7 +102,7 @@ def find_value(
         if is_fixed[i]:
             continue
         aim = float(old)
-        total = abs(float(extra[i]))
+        total = float(extra[i])
         for axis in range(3):
             aim += step * flow[i, axis]
             if prior[i, axis] >= 0:
@@ -115,9 +115,7 @@ def find_value(
             if aim - pull * slope <= center:
                 found = aim - pull * slope
                 break
-            slope += 2.0 * votes[i, b]
-            if (b == 0 and extra[i] < 0.0) or (b == BINS - 1 and extra[i] > 0.0):
-                slope += 2.0 * abs(float(extra[i]))
+            slope += 2.0 * (votes[i, b] + (extra[i] if b == BINS - 1 else 0.0))
             if aim - pull * slope <= center:
                 found = center
                 break
