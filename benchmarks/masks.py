@@ -41,6 +41,8 @@ FRESH = {
     "drawn 63 before olive": (63, False, (110, 115, 70)), "drawn 64, painted, before grey": (64, True, (150, 150, 150)),
     "drawn 65 before white": (65, False, (240, 240, 240)), "drawn 66, painted, before black": (66, True, (20, 18, 18)),
 }  # fmt: skip
+# looked at once, after which two rules were changed
+LOOKED_AT = ("drawn 62, painted, before clay", "drawn 64, painted, before grey")
 CASES = (*(f"lego before {name}" for name in BACKGROUNDS), *FRESH)
 NUM_VIEWS, WIDTH = 8, 400
 # every fifth photograph; pixels farther from the outline than this are told wrongly by more than blur
@@ -112,8 +114,8 @@ def measured(case: str) -> dict[str, Any]:
     peer_s = time.process_time() - start
     ours, peer = scores([s.inside for s in silhouettes], true), scores(peers, true)
     return {
-        "case": case, "fresh": case in FRESH, "iou": ours[0], "least_iou": ours[1], "wrong_far": ours[2],
-        "cpu_ms": 1e3 * ours_s / len(true), "peer_iou": peer[0], "peer_least_iou": peer[1],
+        "case": case, "fresh": case in FRESH and case not in LOOKED_AT, "iou": ours[0], "least_iou": ours[1],
+        "wrong_far": ours[2], "cpu_ms": 1e3 * ours_s / len(true), "peer_iou": peer[0], "peer_least_iou": peer[1],
         "peer_cpu_ms": 1e3 * peer_s / len(true),
     }  # fmt: skip
 

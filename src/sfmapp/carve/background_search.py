@@ -14,6 +14,7 @@ from sfmapp.carve.graph_cut import cut_by_mask, shrunk_picture
 from sfmapp.carve.smooth_backgrounds import cut_from_smooth
 from sfmapp.carve.still_backgrounds import StillBackground, cut_from_background, learn_background
 from sfmapp.carve.still_cameras import still_groups
+from sfmapp.carve.still_matching import edge_band
 from sfmapp.errors import InputError
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
@@ -32,7 +33,7 @@ _TELLING = 0.005
 # 0.97 and more at 1.6 and 2.1 %
 _ALIKE = 0.025
 # before a still camera colours do where they overlap by less (Oxford's dinosaur before blue: 0.5 %, eight rendered sets
-# before clutter 2.4 to 6.9 %), and take no more than this of what never changes for the object
+# before clutter 2.4 to 6.9 %), and take no more than this along the edges for the object
 _PLAIN, _TAKEN = 0.01, 0.02
 # so much of the outline of what never changes is told by its colours alone, from which on it is said: solids of
 # revolution with a handle have 0.18 to 0.56, others up to 0.12 (benchmarks/masks_still.py)
@@ -88,9 +89,9 @@ def find_background(
     Raises:
         InputError: nothing stands out of the background, or the photograph of it cannot be used.
     """
-    still = _still_backgrounds(records, pictures, given)
     model = None if given is not None else learn_colors(pictures)
-    if still and not _colors_do(model, pictures, still):
+    still = [] if _colors_do(model, pictures) else _still_backgrounds(records, pictures, given)
+    if still:
         places = "one place" if len(still) == 1 else f"{len(still)} places"
         events.decided(
             STAGE,
@@ -113,13 +114,13 @@ def find_background(
     return Background(model), model.error, []
 
 
-def _colors_do(model: ColorModel | None, pictures: Sequence[Pixels], still: Sequence[StillBackground]) -> bool:
-    """Whether colours tell the object of a camera that stands still: its background is a plain sheet, of which they
-    take nothing for the object where nothing ever changes."""
+def _colors_do(model: ColorModel | None, pictures: Sequence[Pixels]) -> bool:
+    """Whether colours tell the object though the camera may stand still: its background is a plain sheet, of which they
+    take nothing for the object along the edges of the pictures."""
     if model is None or model.error > _PLAIN:
         return False
-    around = ~np.any([scene.spanned for scene in still], axis=0)
-    taken = [object_mask(shrunk_picture(pictures[i]), model)[around] for i in range(0, len(pictures), 4)]
+    small = [shrunk_picture(picture) for picture in pictures[::4]]
+    taken = [object_mask(picture, model)[edge_band(picture.shape)] for picture in small]
     return bool(np.mean(np.concatenate(taken)) < _TAKEN)
 
 

@@ -72,7 +72,7 @@ class Matched:
 
     def is_there(self, color: Picture, sigma: Picture) -> bool:
         """Whether the photograph shows the background along its edges, and what is fine in it."""
-        band = _band(sigma.shape)
+        band = edge_band(sigma.shape)
         fine, expected = _fine(color)[band], _fine(self.expected)[band]
         contrast = float(np.linalg.norm(expected)) / np.sqrt(expected.size)
         likeness = float((fine * expected).sum() / max(np.linalg.norm(fine) * np.linalg.norm(expected), 1e-6))
@@ -96,7 +96,7 @@ def matched(color: Picture, background: Picture) -> Matched:
     basis = _basis(background.shape)
     gains, shift = np.outer(np.ones(3), [1.0, 0.0, 0.0]), np.zeros(2)
     where = np.zeros(background.shape[:2], bool)
-    where[::_EVERY, ::_EVERY] = _band(background.shape)[::_EVERY, ::_EVERY]
+    where[::_EVERY, ::_EVERY] = edge_band(background.shape)[::_EVERY, ::_EVERY]
     for _ in range(_ROUNDS):
         light = _light(basis, gains)
         moved = moved_by(background, shift)
@@ -123,7 +123,7 @@ def measured_sigma(colors: list[Picture], matches: list[Matched], background: Pi
     """(h, w) standard deviation of the background: noise, by the edges of the pictures, and what a shift leaves."""
     import cv2
 
-    band = _band(background.shape)
+    band = edge_band(background.shape)
     rest = [np.median(np.abs(c - m.expected)[band]) for c, m in zip(colors, matches, strict=True)]
     noise = np.clip(1.4826 * float(np.median(rest)), _LEAST_NOISE, _MOST_NOISE)
     across, down = _slopes(background)
@@ -168,7 +168,8 @@ def _slopes(picture: Picture) -> tuple[Picture, Picture]:
     return cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
 
 
-def _band(shape: tuple[int, ...]) -> Mask:
+def edge_band(shape: tuple[int, ...]) -> Mask:
+    """(h, w) the band along the edges of a picture, where the object hardly is."""
     width = max(2, round(_BAND * min(shape[:2])))
     band = np.ones(shape[:2], bool)
     band[width:-width, width:-width] = False
