@@ -14,6 +14,7 @@ Entities (on the timeline ``wave``, but for what is there from the beginning)::
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,16 +25,14 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.viewer.cameras_rrd import BLUE, log_cameras
 from sfmapp.viewer.dense_replay import DenseReplay
 from sfmapp.viewer.rrd_file import recording_file
-from sfmapp.viewer.stage import body_of, eye_direction, frame_view, frustum_length, turn_to_z
+from sfmapp.viewer.stage import body_of, eye_direction, frame_view, turn_to_z
 
 APPLICATION = "sfmapp dense"
 TIMELINE = "wave"
 _SCENE = "world/scene"
-# negative: in points of the screen, not in units of the scene
-_LINE_WIDTH = -1.0
-_BLUE = (70, 150, 255)
 _PLAYED_S = 8.0
 _LEGEND_PX = (520, 96)
 # the eye is placed by so many of the points
@@ -90,28 +89,16 @@ def _draw_waves(recording: rr.RecordingStream, replay: DenseReplay) -> None:
         recording.log(f"{_SCENE}/patches/wave{wave}", points)
         recording.log("plots/patches", rr.Scalars(float(replay.step_total[s])))
     recording.reset_time()
-    style = rr.SeriesLines(colors=[_BLUE], names=["patches"], widths=[2.0])
+    style = rr.SeriesLines(colors=[BLUE], names=["patches"], widths=[2.0])
     recording.log("plots/patches", style, static=True)
 
 
 def _draw_cameras(recording: rr.RecordingStream, replay: DenseReplay) -> None:
-    length = frustum_length(rigid3.center(replay.cam_from_world), replay.xyz.astype(np.float64))
-    world_from_cam = rigid3.inverse(replay.cam_from_world)
-    for v, name in enumerate(replay.view_names):
-        path = rr.new_entity_path(["world", "scene", "cameras", name])
-        pose = rr.Transform3D(
-            translation=world_from_cam[v, 4:], quaternion=rr.Quaternion(xyzw=world_from_cam[v, :4].tolist())
-        )
-        recording.log(path, pose, static=True)
-        recording.log(path, rr.TransformAxes3D(1e-6 * length), static=True)
-        fx, fy, cx, cy = replay.view_k[v]
-        pinhole = rr.Pinhole(
-            image_from_camera=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], resolution=replay.view_size[v].tolist(),
-            camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=length, line_width=_LINE_WIDTH, color=_BLUE,
-        )  # fmt: skip
-        recording.log(path, pinhole, static=True)
-        jpeg = replay.photo[replay.photo_ptr[v] : replay.photo_ptr[v + 1]].tobytes()
-        recording.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"), static=True)
+    files = (replay.photo[a:b].tobytes() for a, b in itertools.pairwise(replay.photo_ptr))
+    pictures = [rr.EncodedImage(contents=jpeg, media_type="image/jpeg") for jpeg in files]
+    log_cameras(
+        recording, replay.view_names, replay.cam_from_world, replay.view_k, replay.view_size, pictures, replay.xyz
+    )
 
 
 def _draw_mesh(recording: rr.RecordingStream, replay: DenseReplay) -> None:

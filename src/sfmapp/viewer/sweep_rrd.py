@@ -21,12 +21,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from sfmapp.geometry import rigid3
+from sfmapp.viewer.cameras_rrd import BLUE, LINE_WIDTH, log_cameras
 from sfmapp.viewer.rrd_file import recording_file
-from sfmapp.viewer.stage import body_of, eye_direction, frame_view, frustum_length, turn_to_z
+from sfmapp.viewer.stage import body_of, eye_direction, frame_view, turn_to_z
 from sfmapp.viewer.sweep_replay import SweepReplay
 
 APPLICATION, TIMELINE = "sfmapp sweep", "map"
-_SCENE, _BLUE, _LINE_WIDTH = "world/scene", (70, 150, 255), -1.0
+_SCENE = "world/scene"
 _SHOWN = {"photograph": "photograph", "depth": "depth, near is red", "sigma": "sigma / depth, bright is bad"}
 # the timeline takes so long, and the eye is placed by so many of the points
 _PLAYED_S, _FRAMED_POINTS = 8.0, 20_000
@@ -41,7 +42,8 @@ def write_sweep_rrd(replay: SweepReplay, path: Path) -> None:
         # axes of no length are an error to the viewer
         recording.log(_SCENE, rr.TransformAxes3D(1e-6), static=True)
         recording.log("about", rr.TextDocument(replay.story, media_type="text/markdown"), static=True)
-        _draw_cameras(recording, replay)
+        pictures = [_picture(replay, view, 1) for view in range(len(replay.names))]
+        log_cameras(recording, replay.names, replay.cam_from_world, replay.k, replay.size, pictures, replay.xyz)
         _draw_maps(recording, replay)
         points = rr.Points3D(replay.xyz, colors=replay.sigma_rgb, radii=replay.radius)
         recording.log(f"{_SCENE}/sigma", points, static=True)
@@ -65,29 +67,10 @@ def _draw_maps(recording: rr.RecordingStream, replay: SweepReplay) -> None:
     recording.reset_time()
 
 
-def _draw_cameras(recording: rr.RecordingStream, replay: SweepReplay) -> None:
-    length = frustum_length(rigid3.center(replay.cam_from_world), replay.xyz.astype(np.float64))
-    world_from_cam = rigid3.inverse(replay.cam_from_world)
-    for view, name in enumerate(replay.names):
-        path = rr.new_entity_path(["world", "scene", "cameras", name])
-        pose = rr.Transform3D(
-            translation=world_from_cam[view, 4:], quaternion=rr.Quaternion(xyzw=world_from_cam[view, :4].tolist())
-        )
-        recording.log(path, pose, static=True)
-        recording.log(path, rr.TransformAxes3D(1e-6 * length), static=True)
-        fx, fy, cx, cy = replay.k[view]
-        pinhole = rr.Pinhole(
-            image_from_camera=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], resolution=replay.size[view].tolist(),
-            camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=length, line_width=_LINE_WIDTH, color=_BLUE,
-        )  # fmt: skip
-        recording.log(path, pinhole, static=True)
-        recording.log(path, _picture(replay, view, 1), static=True)
-
-
 def _draw_volume(recording: rr.RecordingStream, replay: SweepReplay) -> None:
     if not replay.cell:
         return
-    box = rr.Boxes3D(mins=replay.box[:1], sizes=replay.box[1:] - replay.box[:1], radii=_LINE_WIDTH, colors=_BLUE)
+    box = rr.Boxes3D(mins=replay.box[:1], sizes=replay.box[1:] - replay.box[:1], radii=LINE_WIDTH, colors=BLUE)
     recording.log(f"{_SCENE}/occupancy/box", box, static=True)
     if len(replay.cell_xyz):
         cells = rr.Points3D(replay.cell_xyz, colors=replay.cell_rgb, radii=0.5 * replay.cell)
