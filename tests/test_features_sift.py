@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sfmapp.features import scale_space
+from sfmapp.features.octaves import Octave, Scratch
 from sfmapp.features.sift import extract_sift
 
 DEFAULTS = {
@@ -247,3 +249,61 @@ def test_more_true_matches_than_colmap(data_root: Path, scene: str, first: int) 
     our_error, their_error = true_matches(ours, fundamental), true_matches(theirs, fundamental)
     assert len(our_error) > 1.05 * len(their_error)
     assert np.median(our_error) < 1.03 * np.median(their_error)
+
+
+@pytest.mark.parametrize("size", [(301, 223), (64, 500), (90, 17)])
+def test_windows_of_rows_change_no_byte(size: tuple[int, int]) -> None:
+    """Of textures, of noise, whose keypoints move far while they are refined, and of patterns with equal peaks."""
+    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    noise = np.random.default_rng(3).integers(0, 256, x.shape).astype(np.uint8)
+    waves = (128 + 100 * np.cos(x / 6) * np.cos(y / 6)).astype(np.uint8)
+    for picture in (texture(size), noise, waves):
+        for budget in (60, 100_000):
+            options = DEFAULTS | {"max_num_features": budget}
+            whole = extract_sift(picture, None, **options)  # type: ignore[arg-type]
+            for scratch in (Scratch(whole_px=1), Scratch(whole_px=20_000)):
+                for expected, found in zip(whole, extract_sift(picture, None, **options, scratch=scratch), strict=True):  # type: ignore[arg-type]
+                    np.testing.assert_array_equal(found, expected)
+
+
+def test_levels_looked_up_around_a_pixel_are_those_of_the_octave() -> None:
+    picture = texture((140, 110))
+    octave = Octave(picture, 0.5, Scratch())
+    *_, whole = octave.windows_to_search()
+    finest = [level.copy() for level in whole.levels]  # some are overwritten by the next octave
+    coarser = octave.coarser()
+    octave.hand_down(whole._replace(rows=(0, octave.shape[0])), coarser)
+    *_, whole_coarser = coarser.windows_to_search()
+    for which, levels in ((octave, finest), (coarser, whole_coarser.levels)):
+        height, width = which.shape
+        for row, col in ((6, 5), (height // 2, width // 2 + 1), (height - 6, width - 7), (9, width - 6)):
+            window = which.look_up(row, col)
+            top, left = window.origin
+            for found, level in zip(window.levels, levels, strict=True):
+                rows, cols = found.shape
+                assert top < row < top + rows - 1
+                assert left < col < left + cols - 1
+                np.testing.assert_array_equal(found, level[top : top + rows, left : left + cols])
+
+
+def test_extrema_are_those_of_a_plain_search() -> None:
+    """All 26 neighbours, in numpy, at widths around whole vectors and whole tiles."""
+    rng = np.random.default_rng(0)
+    for width in (13, 26, 27, 90, scale_space.TILE + 12):
+        flat = rng.normal(size=6 * 40 * width + 16).astype(np.float32)
+        levels = tuple(flat[:-16].reshape(6, 40, width))
+        place, value = np.empty((40 * width, 4), np.int32), np.empty(40 * width, np.float32)
+        rows = np.zeros((scale_space.NUM_ROWS_AT_WORK, scale_space.PITCH), np.float32)
+        marks = np.empty(scale_space.PITCH, np.int64)
+        count = scale_space.find_extrema(levels, (100, 105, 135), 0.5, rows, marks, place, value)
+        d = np.diff(levels, axis=0)
+        near = np.lib.stride_tricks.sliding_window_view(d, (3, 3, 3))[:, 4:-4, 4:-4]
+        middle = d[1:-1, 5:-5, 5:-5]
+        is_peak = (middle == near.max(axis=(3, 4, 5))) & (middle > 0.5)
+        is_peak |= (middle == near.min(axis=(3, 4, 5))) & (middle < -0.5)
+        expected = np.argwhere(is_peak) + np.array([1, 105, 5])
+        found = place[:count, :3]
+        np.testing.assert_array_equal(found[np.lexsort(found.T[::-1])], expected)
+        np.testing.assert_array_equal(
+            value[:count], np.abs(d[found[:, 0], found[:, 1] - 100, found[:, 2]])
+        )  # fmt: skip

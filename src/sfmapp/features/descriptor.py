@@ -221,12 +221,13 @@ def describe(
 
 @numba.njit(cache=True, nogil=True)
 def orient_all(
-    levels: tuple[Floats, ...], found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
+    levels: tuple[Floats, ...], top: int, found: NDArray[np.float64], max_num: int, angles: NDArray[np.float64]
 ) -> None:
     """Orientations of the keypoints of an octave.
 
     Args:
         levels: levels 1 to 3 of the octave.
+        top: row of the octave that they begin with; even, so that halves are rounded as in the whole octave.
         found: (N, >= 3) float64 column, row, layer.
         angles: (N, max_num) float64, filled, strongest first; NaN where there are fewer.
     """
@@ -236,17 +237,19 @@ def orient_all(
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
-        find_orientations(levels[layer - 1], found[n, 0], found[n, 1], sigma, max_num, samples, hist, angles[n])
+        x, y = found[n, 0], found[n, 1] - top
+        find_orientations(levels[layer - 1], x, y, sigma, max_num, samples, hist, angles[n])
 
 
 @numba.njit(cache=True, nogil=True)
 def describe_all(
-    levels: tuple[Floats, ...], found: NDArray[np.float64], angle: NDArray[np.float64], out: NDArray[np.uint8]
-) -> None:
+    levels: tuple[Floats, ...], top: int, found: NDArray[np.float64], angle: NDArray[np.float64],
+    out: NDArray[np.uint8],
+) -> None:  # fmt: skip
     """Descriptors of the keypoints of an octave.
 
     Args:
-        levels: levels 1 to 3 of the octave.
+        levels, top: as in :func:`orient_all`.
         found: (N, >= 3) float64 column, row, layer; angle: (N,) radians.
         out: (N, 128) uint8, filled.
     """
@@ -255,4 +258,4 @@ def describe_all(
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
-        describe(levels[layer - 1], found[n, 0], found[n, 1], sigma, angle[n], samples, hist, out[n])
+        describe(levels[layer - 1], found[n, 0], found[n, 1] - top, sigma, angle[n], samples, hist, out[n])

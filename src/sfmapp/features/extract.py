@@ -14,9 +14,10 @@ import numpy as np
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.features.octaves import Scratch, bytes_of_scale_space
 from sfmapp.features.orb import extract_orb
 from sfmapp.features.report import FEW_FEATURES, FeaturesReport, ImageFeatures
-from sfmapp.features.sift import Scratch, compile_kernels, extract_sift
+from sfmapp.features.sift import compile_kernels, extract_sift
 from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 from sfmapp.scene.features import DescriptorMetric, Features
 
@@ -230,11 +231,11 @@ def _report(
 def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:
     """Estimate of the memory that one image takes at the peak of its extraction."""
     pixels = record.width * record.height
-    detected = pixels * min(1.0, options.max_size_px / max(record.width, record.height)) ** 2
-    # three channels, grey and mask of the full image; SIFT: six levels of four times as many float32 pixels and what
-    # is kept of the coarser octaves
-    per_pixel = 112 if options.kind == "sift" else 12
-    return int(5 * pixels + per_pixel * detected)
+    scale = min(1.0, options.max_size_px / max(record.width, record.height))
+    width, height = round(scale * record.width), round(scale * record.height)
+    # three channels, grey and mask of the full image
+    work = bytes_of_scale_space(height, width) if options.kind == "sift" else 12 * height * width
+    return 5 * pixels + work
 
 
 def _budget_bytes(options: FeatureOptions) -> int:

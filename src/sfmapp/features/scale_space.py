@@ -1,22 +1,44 @@
 """The inner loops of SIFT's detector (Lowe, IJCV 2004): blurs, the extrema of the scale space, their refinement.
 
-Pixels here are those of an octave, with the centre of the top-left one at (0, 0). ``gauss`` holds the levels
-0..5 of an octave, (H, W) float32 each; level l has a blur of ``SIGMA * 2 ** (l / 3)`` pixels of the octave.
+Pixels here are those of an octave, with the centre of the top-left one at (0, 0). Level l of an octave, of 0 to
+5, has a blur of ``SIGMA * 2 ** (l / 3)`` of its pixels.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.simd.f32x16 import (
+    WIDTH,
+    larger,
+    load,
+    smaller,
+    splat,
+    store,
+    subtract,
+    where_above,
+    where_at_least,
+)
+from sfmapp.simd.pointers import Pointer, pointer
+
 NUM_LAYERS = 3
 NUM_LEVELS = NUM_LAYERS + 3
+NUM_DIFFERENCES = NUM_LEVELS - 1
 SIGMA = 1.6
 # pixels at the edge of an octave where nothing is detected: the blurs have mirrored the image there
 BORDER = 5
-# columns that are scanned together, so that the rows at work stay in the cache
-TILE = 1024
+# columns that are scanned together, so that the rows at work stay in the cache, and floats from one row to the next
+TILE = 512
+PITCH = TILE + 2 * WIDTH
+# rows at work: three of each difference, then their extremes
+_EXTREMES = 3 * NUM_DIFFERENCES
+NUM_ROWS_AT_WORK = _EXTREMES + 2 * NUM_DIFFERENCES
+# moves of a keypoint while it is refined
+_NUM_ROUNDS = 5
 
 Floats = NDArray[np.float32]
 
@@ -40,136 +62,150 @@ def _two_taps(out: Floats, k: Floats, a1: Floats, b1: Floats, a2: Floats, b2: Fl
 
 
 @numba.njit(cache=True, nogil=True)
-def blur(source: Floats, k: Floats, line: Floats, target: Floats) -> None:
+def blur(
+    source: Floats, k: Floats, line: Floats, target: Floats, rows: tuple[int, int, int], tops: tuple[int, int]
+) -> None:
     """Convolve columns, then rows, with a symmetric kernel; the image is mirrored at the centres of its outer pixels.
 
     A quarter to a half faster than OpenCV's, and the same to the last bit on any processor, as no multiplication is
-    fused with an addition.
+    fused with an addition, and for any division of the image into rows.
 
     Args:
-        source: (H, W) float32, H and W at least N.
+        source: (R, W) float32, rows of an image (H, W) with H and W at least N: those to blur and N - 1 on either
+            side, where the image has them.
         k: (N,) float32, the kernel from its middle outwards; N is odd and at least 5.
         line: (W + 2 N,) float32, working memory.
-        target: (H, W) float32, filled; not the source.
+        target: (T, W) float32, the rows to blur are filled; not the source.
+        rows: first row of the image to blur, the one behind the last, and H.
+        tops: which rows of the image the first ones of source and target are.
     """
-    h, w = source.shape
+    first, last, h = rows
+    top, target_top = tops
+    w = source.shape[1]
     n = k.shape[0] - 1
     s = source
-    for r in range(h):
-        column = line[n : n + w]
+    for r in range(first, last):
+        column, out = line[n : n + w], target[r - target_top]
         up, down = r, 2 * h - 2 - r
         _taps_0_to_4(
-            column, k, s[r], s[abs(up - 1)], s[min(r + 1, down - 1)], s[abs(up - 2)], s[min(r + 2, down - 2)],
-            s[abs(up - 3)], s[min(r + 3, down - 3)], s[abs(up - 4)], s[min(r + 4, down - 4)], w,
+            column, k, s[r - top],
+            s[abs(up - 1) - top], s[min(r + 1, down - 1) - top], s[abs(up - 2) - top], s[min(r + 2, down - 2) - top],
+            s[abs(up - 3) - top], s[min(r + 3, down - 3) - top], s[abs(up - 4) - top], s[min(r + 4, down - 4) - top], w,
         )  # fmt: skip
         for i in range(5, n, 2):
             _two_taps(
-                column, k[i:], s[abs(up - i)], s[min(r + i, down - i)],
-                s[abs(up - i - 1)], s[min(r + i + 1, down - i - 1)], w,
+                column, k[i:], s[abs(up - i) - top], s[min(r + i, down - i) - top],
+                s[abs(up - i - 1) - top], s[min(r + i + 1, down - i - 1) - top], w,
             )  # fmt: skip
         for i in range(1, n + 1):
             line[n - i] = line[n + i]
             line[n + w - 1 + i] = line[n + w - 1 - i]
         _taps_0_to_4(
-            target[r], k, column, line[n - 1 :], line[n + 1 :], line[n - 2 :], line[n + 2 :],
+            out, k, column, line[n - 1 :], line[n + 1 :], line[n - 2 :], line[n + 2 :],
             line[n - 3 :], line[n + 3 :], line[n - 4 :], line[n + 4 :], w,
         )  # fmt: skip
         for i in range(5, n, 2):
-            _two_taps(target[r], k[i:], line[n - i :], line[n + i :], line[n - i - 1 :], line[n + i + 1 :], w)
+            _two_taps(out, k[i:], line[n - i :], line[n + i :], line[n - i - 1 :], line[n + i + 1 :], w)
 
 
 @numba.njit(cache=True, nogil=True)
-def _subtract(upper: Floats, lower: Floats, out: Floats, num: int) -> None:
-    for c in range(num):
-        out[c] = upper[c] - lower[c]
+def _differences(levels: tuple[Pointer, ...], at: int, rows: Pointer, middle: int, num: int) -> None:
+    """Fill the row after ``middle`` of the five differences, and the largest and smallest of their last three rows."""
+    new, old = (middle + 1) % 3 * PITCH, (middle + 2) % 3 * PITCH
+    for c in range(0, num, WIDTH):
+        lower = load(levels[0], at + c)
+        for d in range(NUM_DIFFERENCES):
+            upper = load(levels[d + 1], at + c)
+            value, ring, extremes = subtract(upper, lower), 3 * d * PITCH + c, (_EXTREMES + 2 * d) * PITCH + c
+            store(rows, ring + new, value)
+            a, b = load(rows, ring + old), load(rows, ring + middle * PITCH)
+            store(rows, extremes, larger(larger(a, b), value))
+            store(rows, extremes + PITCH, smaller(smaller(a, b), value))
+            lower = upper
 
 
 @numba.njit(cache=True, nogil=True)
-def _extremes_of_three(row: Floats, most: Floats, least: Floats, num: int) -> None:
-    """Largest and smallest of ``row[c : c + 3]``."""
-    for c in range(num):
-        v0, v1, v2 = row[c], row[c + 1], row[c + 2]
-        big = v0 if v0 > v1 else v1
-        small = v0 if v0 < v1 else v1
-        most[c] = big if big > v2 else v2
-        least[c] = small if small < v2 else v2
+def _largest_around(rows: Pointer, difference: int, c: int) -> Any:
+    """The largest of 3 x 3 values of a difference."""
+    at = (_EXTREMES + 2 * difference) * PITCH + c
+    return larger(larger(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
 
 
 @numba.njit(cache=True, nogil=True)
-def _flag_extremes(
-    row: Floats, most: Floats, least: Floats, threshold: np.float32, flags: NDArray[np.uint8], num: int
-) -> None:
-    """Flag the values of a row that are the extremes of their 3 x 3 pixels and far enough from zero."""
-    for c in range(num):
-        v = row[c + 1]
-        big = most[0, c] if most[0, c] > most[1, c] else most[1, c]
-        big = big if big > most[2, c] else most[2, c]
-        small = least[0, c] if least[0, c] < least[1, c] else least[1, c]
-        small = small if small < least[2, c] else least[2, c]
-        flags[c] = ((v >= big) & (v > threshold)) | ((v <= small) & (v < -threshold))
+def _smallest_around(rows: Pointer, difference: int, c: int) -> Any:
+    """The smallest of 3 x 3 values of a difference."""
+    at = (_EXTREMES + 2 * difference + 1) * PITCH + c
+    return smaller(smaller(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
 
 
 @numba.njit(cache=True, nogil=True)
-def _exceeds(value: float, rows: Floats, col: int) -> bool:
-    """Whether none of the 3 x 3 values of another layer is beyond a value, on its own side of zero."""
-    for i in range(3):
-        for c in range(col, col + 3):
-            if (rows[i, c] > value) if value > 0.0 else (rows[i, c] < value):
-                return False
-    return True
+def _mark_extremes(rows: Pointer, middle: int, low: Any, high: Any, marks: Pointer, num: int) -> None:
+    """Marks (C, 3): of every 16 pixels and each layer the bits of those that are extremes and far enough from zero."""
+    for c in range(0, num, WIDTH):
+        most = (
+            _largest_around(rows, 0, c), _largest_around(rows, 1, c), _largest_around(rows, 2, c),
+            _largest_around(rows, 3, c), _largest_around(rows, 4, c),
+        )  # fmt: skip
+        least = (
+            _smallest_around(rows, 0, c), _smallest_around(rows, 1, c), _smallest_around(rows, 2, c),
+            _smallest_around(rows, 3, c), _smallest_around(rows, 4, c),
+        )  # fmt: skip
+        for layer in range(1, NUM_LAYERS + 1):
+            v = load(rows, (3 * layer + middle) * PITCH + c + 1)
+            top = larger(larger(most[layer - 1], most[layer]), most[layer + 1])
+            bottom = smaller(smaller(least[layer - 1], least[layer]), least[layer + 1])
+            peaks = where_at_least(v, top) & where_above(v, low)
+            marks[c // WIDTH * NUM_LAYERS + layer - 1] = peaks | (where_at_least(bottom, v) & where_above(high, v))
 
 
 @numba.njit(cache=True, nogil=True)
 def find_extrema(
-    gauss: tuple[Floats, ...], threshold: float, rows: Floats, flags: NDArray[np.uint8],
+    levels: tuple[Floats, ...], span: tuple[int, int, int], threshold: float, rows: Floats, marks: NDArray[np.int64],
     place: NDArray[np.int32], value: Floats,
 ) -> int:  # fmt: skip
     """Pixels whose difference of Gaussians is the largest or smallest of its 26 neighbours and exceeds the threshold.
 
-    Row by row in vector instructions within a layer; the few that pass are held against the layers beside it.
-
     Args:
-        gauss: the six levels of an octave, (H, W) float32 each.
+        levels: the six levels of an octave, (R, W) float32 each, with at least 16 floats behind the last row, which
+            are read and do not matter.
+        span: which row of the octave they begin with, the first row to search, and the one behind the last.
         threshold: grey levels.
-        rows: (11, 3, TILE + 2) float32 and flags: (TILE,) uint8, working memory: the last three rows of the five
-            differences, then of the largest and of the smallest of three neighbours in each of the middle ones.
-        place: (C, 3) int32 and value: (C,) float32, filled with layer, row, column and absolute difference.
+        rows: (25, PITCH) float32 and marks: (PITCH,) int64, working memory: the last three rows of the five
+            differences, then of each the largest and the smallest of three.
+        place: (C, 4) int32 and value: (C,) float32, filled with layer, row, column, the rounds of refinement that it
+            may have, and the absolute difference.
 
     Returns:
         How many there are; those beyond C are counted only.
     """
-    height, width = gauss[0].shape
-    g0, g1, g2, g3, g4, g5 = gauss
-    low = np.float32(threshold)
-    eights = flags.view(np.uint64)
+    top, first, last = span
+    width = levels[0].shape[1]
+    pointers = (
+        pointer(levels[0]), pointer(levels[1]), pointer(levels[2]), pointer(levels[3]), pointer(levels[4]),
+        pointer(levels[5]),
+    )  # fmt: skip
+    at_work, marked = pointer(rows), pointer(marks)
+    low, high = splat(np.float32(threshold)), splat(np.float32(-threshold))
     count = 0
     for left in range(BORDER, width - BORDER, TILE):
         n = min(TILE, width - BORDER - left)
-        a, b = left - 1, left + n + 1
-        for r in range(BORDER - 1, height - BORDER + 1):
-            slot, middle = r % 3, (r - 1) % 3
-            _subtract(g1[r, a:b], g0[r, a:b], rows[0, slot], n + 2)
-            _subtract(g2[r, a:b], g1[r, a:b], rows[1, slot], n + 2)
-            _subtract(g3[r, a:b], g2[r, a:b], rows[2, slot], n + 2)
-            _subtract(g4[r, a:b], g3[r, a:b], rows[3, slot], n + 2)
-            _subtract(g5[r, a:b], g4[r, a:b], rows[4, slot], n + 2)
-            for layer in range(1, NUM_LAYERS + 1):
-                most, least = rows[4 + layer], rows[7 + layer]
-                _extremes_of_three(rows[layer, slot], most[slot], least[slot], n)
-                if r < BORDER + 1:
+        for r in range(first - 1, last + 1):
+            middle = (r - 1) % 3
+            _differences(pointers, (r - top) * width + left - 1, at_work, middle, n + 2)
+            if r < first + 1:
+                continue
+            _mark_extremes(at_work, middle, low, high, marked, n)
+            for m in range(NUM_LAYERS * ((n + WIDTH - 1) // WIDTH)):
+                if marks[m] == 0:
                     continue
-                dog = rows[layer, middle]
-                _flag_extremes(dog, most, least, low, flags, n)
-                for e in range((n + 7) // 8):
-                    if eights[e] == 0:
-                        continue
-                    for c in range(8 * e, min(8 * e + 8, n)):
-                        v = dog[c + 1]
-                        if flags[c] and _exceeds(v, rows[layer - 1], c) and _exceeds(v, rows[layer + 1], c):
-                            if count < place.shape[0]:
-                                place[count, 0], place[count, 1], place[count, 2] = layer, r - 1, left + c
-                                value[count] = abs(v)
-                            count += 1
+                layer, start = m % NUM_LAYERS + 1, m // NUM_LAYERS * WIDTH
+                for c in range(start, min(start + WIDTH, n)):
+                    if marks[m] >> (c - start) & 1:
+                        if count < place.shape[0]:
+                            place[count, 0], place[count, 1], place[count, 2] = layer, r - 1, left + c
+                            place[count, 3] = _NUM_ROUNDS
+                            value[count] = abs(rows[3 * layer + middle, c + 1])
+                        count += 1
     return count
 
 
@@ -206,24 +242,37 @@ def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArr
 
 @numba.njit(cache=True, nogil=True)
 def refine_extremum(
-    gauss: tuple[Floats, ...], layer: int, row: int, col: int, edge_threshold: float, out: NDArray[np.float64]
-) -> bool:
+    levels: tuple[Floats, ...], origin: tuple[int, int], shape: tuple[int, int], place: NDArray[np.int32],
+    edge_threshold: float, out: NDArray[np.float64],
+) -> bool:  # fmt: skip
     """Fit a parabola to the 27 differences around a pixel (Brown and Lowe, BMVC 2002), moving on while it lies outside.
 
     Args:
+        levels: the six levels of an octave, (R, C) float32 each.
+        origin: row and column of the octave that they begin with; shape: (H, W) of the octave.
+        place: (4,) layer, row, column and rounds that are left, which are more than 0 afterwards only if it moved out
+            of the levels: then it can go on there with others.
+        edge_threshold: largest ratio of the principal curvatures.
         out: (4,) float64, filled with column, row, layer (all with fractions) and absolute difference there.
 
     Returns:
         Whether the fit settled and the place does not lie on an edge.
     """
-    height, width = gauss[0].shape
+    height, width = shape
+    num_rows, num_cols = levels[0].shape
+    layer, row, col, rounds = place[0], place[1], place[2], place[3]
+    place[3] = 0
     d = np.empty((3, 3, 3))
-    for _ in range(5):
+    while rounds > 0:
+        top, left = row - 1 - origin[0], col - 1 - origin[1]
+        if top < 0 or left < 0 or top + 3 > num_rows or left + 3 > num_cols:
+            place[0], place[1], place[2], place[3] = layer, row, col, rounds
+            return False
+        rounds -= 1
         for k in range(3):
             for i in range(3):
                 for j in range(3):
-                    r, c = row + i - 1, col + j - 1
-                    d[k, i, j] = gauss[layer + k][r, c] - gauss[layer + k - 1][r, c]
+                    d[k, i, j] = levels[layer + k][top + i, left + j] - levels[layer + k - 1][top + i, left + j]
         v = d[1, 1, 1]
         gx = 0.5 * (d[1, 1, 2] - d[1, 1, 0])
         gy = 0.5 * (d[1, 2, 1] - d[1, 0, 1])
@@ -263,9 +312,10 @@ def refine_extremum(
 
 @numba.njit(cache=True, nogil=True)
 def refine_all(
-    gauss: tuple[Floats, ...], place: NDArray[np.int32], edge_threshold: float, out: NDArray[np.float64]
-) -> None:
-    """:func:`refine_extremum` of every place (N, 3); rows of out (N, 4) that fail become NaN."""
+    levels: tuple[Floats, ...], origin: tuple[int, int], shape: tuple[int, int], place: NDArray[np.int32],
+    edge_threshold: float, out: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """:func:`refine_extremum` of every place (N, 4); rows of out (N, 4) that fail become NaN."""
     for n in range(place.shape[0]):
-        if not refine_extremum(gauss, place[n, 0], place[n, 1], place[n, 2], edge_threshold, out[n]):
+        if not refine_extremum(levels, origin, shape, place[n], edge_threshold, out[n]):
             out[n, :] = np.nan

@@ -11,20 +11,16 @@ What differs from the textbook, each measured against true cameras on six scenes
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features import scale_space
 from sfmapp.features.descriptor import describe_all, orient_all
-from sfmapp.features.scale_space import NUM_LAYERS, NUM_LEVELS, SIGMA
+from sfmapp.features.octaves import UPSAMPLING, Octave, Scratch, Window
+from sfmapp.features.scale_space import NUM_LAYERS, SIGMA
 
-# pixels of the first octave in one pixel of the image
-_UPSAMPLING = 2
-# the Gaussians are cut off here
-_TRUNCATION_SIGMAS = 3.0
 # candidates per octave that are refined, in budgets: about half of them turn out to lie on edges
 _REFINED_BUDGETS = 2
 # share of the budget that is dealt out evenly over a grid of cells, so that no busy patch takes it all
@@ -34,51 +30,6 @@ _SPREAD_CELLS = 8
 _FULL_SPAN = 128.0
 # ... but not below six standard deviations of what the rounding of the pixels leaves in the finest differences
 _ROUNDING_FLOOR = 0.2
-
-FloatImage = NDArray[np.float32]
-
-
-class Scratch:
-    """Memory for the scale space of one image at a time: taking 150 MB a megapixel and a half anew for every image
-    costs as much time as its descriptors.
-
-    Levels 1 to 3 of the first octave come first, as they are needed to the end. Its other three take as much memory as
-    one and a half times all coarser octaves together, which move in once its extrema are found.
-    """
-
-    def __init__(self) -> None:
-        self._memory = np.empty(0, np.float32)
-        self._end = 0
-
-    def first_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
-        """Six levels (H, W) float32 for a new image; what was handed out before is overwritten."""
-        size = shape[0] * shape[1]
-        if len(self._memory) < NUM_LEVELS * size:
-            self._memory = np.empty(0, np.float32)
-            self._memory = np.empty(NUM_LEVELS * size, np.float32)
-        self._end = 3 * size
-        images = self._memory[: NUM_LEVELS * size].reshape(NUM_LEVELS, *shape)
-        return tuple(images[i] for i in (3, 0, 1, 2, 4, 5))
-
-    def next_octave(self, shape: tuple[int, int]) -> tuple[FloatImage, ...]:
-        """Six levels (H, W) float32, half as large as those before; levels 0, 4 and 5 of the first are overwritten."""
-        start, self._end = self._end, self._end + NUM_LEVELS * shape[0] * shape[1]
-        return tuple(self._memory[start : self._end].reshape(NUM_LEVELS, *shape))
-
-
-@dataclass(frozen=True)
-class _Octave:
-    """Levels 1 to 3 of an octave, and its keypoints (N, 4) float64: column, row, layer, contrast."""
-
-    levels: tuple[FloatImage, ...]
-    found: NDArray[np.float64]
-    # pixels of the image in one pixel of the octave
-    step: float
-
-    def xy(self) -> NDArray[np.float64]:
-        """(N, 2) COLMAP's pixels. The corner of the first pixel is the origin at every resolution up to the doubled
-        one; from there on every second pixel is dropped, which keeps the centre of the first."""
-        return self.found[:, :2] * self.step + 0.5 / _UPSAMPLING
 
 
 def extract_sift(
@@ -107,100 +58,116 @@ def extract_sift(
         down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; the contrast threshold in use.
     """
     threshold = _threshold(gray, contrast_threshold)
-    octaves = _detect(gray, threshold, edge_threshold, max_num_features, scratch or Scratch())
-    found = np.concatenate([octave.found for octave in octaves] or [np.zeros((0, 4))])
-    xy = np.concatenate([octave.xy() for octave in octaves] or [np.zeros((0, 2))])
-    octave_idx = np.repeat(np.arange(len(octaves)), [len(octave.found) for octave in octaves])
+    octaves, places = _detect(gray, threshold, edge_threshold, max_num_features, scratch or Scratch())
+    found = np.concatenate([*places, np.zeros((0, 4))])
+    xy = np.concatenate([octave.xy(place) for octave, place in zip(octaves, places, strict=True)] + [np.zeros((0, 2))])
     chosen = np.sort(_choose(xy, found[:, 3], gray.shape, usable, max_num_features))
-    angles = np.empty((len(chosen), max_num_orientations))
-    for i, octave in enumerate(octaves):
-        mine = octave_idx[chosen] == i
-        angles[mine] = _orient(octave, found[chosen[mine]], max_num_orientations)
+    octave_idx = np.repeat(np.arange(len(octaves)), [len(place) for place in places])[chosen]
+    found, xy = found[chosen], xy[chosen]
+    # seconds have room only if the budget is not full, or where one has no orientation at all
+    for num in (1, max_num_orientations) if len(found) == max_num_features else (max_num_orientations,):
+        angles, vectors = _describe(octaves, octave_idx, found, max_num_orientations, num)
+        if num == max_num_orientations or not np.isnan(angles[:, 0]).any():
+            break
     rank, place = np.nonzero(~np.isnan(angles.T))
-    order = np.lexsort((place, -found[chosen[place], 3], rank))[:max_num_features]
+    order = np.lexsort((place, -found[place, 3], rank))[:max_num_features]
     rank, place = rank[order], place[order]
-    angle, place = angles[place, rank], chosen[place]
+    angle, vector = angles[place, rank], vectors[place, rank]
     scale = SIGMA * 2.0 ** (found[place, 2] / NUM_LAYERS)
     scale *= np.array([octave.step for octave in octaves])[octave_idx[place]] if len(place) else 1.0
     order = np.lexsort((angle, xy[place, 1], xy[place, 0], -scale))
-    angle, place, scale = angle[order], place[order], scale[order]
-    descriptors = np.empty((len(place), 128), np.uint8)
-    for i, octave in enumerate(octaves):
-        # from top to bottom, so that neighbours find each other's pixels in the cache
-        mine = np.flatnonzero(octave_idx[place] == i)
-        mine = mine[np.argsort(place[mine], kind="stable")]
-        out = np.empty((len(mine), 128), np.uint8)
-        describe_all(octave.levels, found[place[mine]], angle[mine], out)
-        descriptors[mine] = out
-    return np.column_stack([xy[place], scale, angle]).astype(np.float32), descriptors, threshold
+    keypoints = np.column_stack([xy[place], scale, angle])[order].astype(np.float32)
+    return keypoints, vector[order], threshold
 
 
 def _threshold(gray: NDArray[np.uint8], contrast_threshold: float) -> float:
     """The contrast threshold, lowered in proportion for images with a small span of grey levels."""
-    share = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
+    import cv2
+
+    share = np.cumsum(cv2.calcHist([gray], [0], None, [256], [0.0, 256.0]), dtype=np.float64) / gray.size
     span = float(np.searchsorted(share, 0.995) - np.searchsorted(share, 0.005))
     return max(contrast_threshold * min(1.0, span / _FULL_SPAN), min(contrast_threshold, _ROUNDING_FLOOR / 255.0))
 
 
 def _detect(
     gray: NDArray[np.uint8], threshold: float, edge_threshold: float, max_num_features: int, scratch: Scratch
-) -> list[_Octave]:
-    """The octaves of the scale space with their keypoints, finest first."""
-    import cv2
-
-    octaves: list[_Octave] = []
-    shape = (_UPSAMPLING * gray.shape[0], _UPSAMPLING * gray.shape[1])
-    levels = scratch.first_octave(shape)
-    while min(shape) > 2 * scale_space.BORDER + 2:
-        if octaves:
-            levels[0][:] = octaves[-1].levels[-1][::2, ::2]
-        else:
-            cv2.resize(gray.astype(np.float32), shape[::-1], dst=levels[1], interpolation=cv2.INTER_LINEAR)
-            _blur(levels[1], SIGMA, levels[0])
-        for i in range(1, NUM_LEVELS):
-            before = SIGMA * 2.0 ** ((i - 1) / NUM_LAYERS)
-            _blur(levels[i - 1], before * math.sqrt(2.0 ** (2.0 / NUM_LAYERS) - 1.0), levels[i])
-        found = _find(levels, 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
-        octaves.append(_Octave(levels[1:4], found, 2.0 ** len(octaves) / _UPSAMPLING))
-        shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
-        levels = scratch.next_octave(shape)
-    return octaves
-
-
-def _blur(image: FloatImage, sigma: float, target: FloatImage) -> None:
-    # the kernel takes the pairs of taps beyond the fourth two at a time
-    reach = 2 * math.ceil(_TRUNCATION_SIGMAS * sigma / 2.0)
-    taps = np.exp(-0.5 * (np.arange(reach + 1) / sigma) ** 2)
-    taps /= taps[0] + 2.0 * taps[1:].sum()
-    line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
-    scale_space.blur(image, taps.astype(np.float32), line, target)
+) -> tuple[list[Octave], list[NDArray[np.float64]]]:
+    """The octaves of the scale space, finest first, and the keypoints of each."""
+    octaves: list[Octave] = []
+    places: list[NDArray[np.float64]] = []
+    scratch.begin()
+    octave = Octave(gray, 1.0 / UPSAMPLING, scratch)
+    while min(octave.shape) > 2 * scale_space.BORDER + 2:
+        coarser = octave.coarser()
+        found = _find(octave, coarser, 255.0 * threshold, edge_threshold, _REFINED_BUDGETS * max_num_features)
+        octaves.append(octave)
+        places.append(found)
+        octave = coarser
+    return octaves, places
 
 
 def _find(
-    levels: tuple[FloatImage, ...], threshold: float, edge_threshold: float, max_refined: int
+    octave: Octave, coarser: Octave, threshold: float, edge_threshold: float, max_refined: int
 ) -> NDArray[np.float64]:
-    """(N, 4) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels)."""
-    rows, flags = np.empty((11, 3, scale_space.TILE + 2), np.float32), np.empty(scale_space.TILE, np.uint8)
+    """(N, 4) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels);
+    fills level 0 of the next one."""
+    strongest, cut = np.zeros(0, np.float32), np.float32(0.0)
+    found, place, value = [np.zeros((0, 4))], [np.zeros((0, 4), np.int32)], [np.zeros(0, np.float32)]
     # the parabola raises the contrast above that of the pixel, so those a little below get their chance
-    start = 0.8 * threshold
-    capacity = max(256, levels[0].size // 64)
-    while True:
-        place, value = np.empty((capacity, 3), np.int32), np.empty(capacity, np.float32)
-        count = scale_space.find_extrema(levels, start, rows, flags, place, value)
-        if count <= capacity:
-            break
-        capacity = count
-    place, value = place[:count], value[:count]
-    if count > max_refined:
-        place = place[value >= -np.partition(-value, max_refined - 1)[max_refined - 1]]
-    found = np.empty((len(place), 4))
-    scale_space.refine_all(levels, np.ascontiguousarray(place), edge_threshold, found)
-    found = found[found[:, 3] >= threshold]
-    found = found[np.lexsort((found[:, 2], found[:, 0], found[:, 1]))]
+    for window, its_place, its_value in _search(octave, coarser, 0.8 * threshold):
+        strongest = np.concatenate([strongest, its_value])
+        if len(strongest) > max_refined:
+            strongest = -np.partition(-strongest, max_refined - 1)[:max_refined]
+            cut = strongest.min()
+        # what is too weak already will be so in the end
+        place.append(its_place[its_value >= cut])
+        value.append(its_value[its_value >= cut])
+        found.append(np.empty((len(place[-1]), 4)))
+        scale_space.refine_all(window.levels, window.origin, octave.shape, place[-1], edge_threshold, found[-1])
+    is_strong = np.concatenate(value) >= cut
+    places, keypoints = np.concatenate(place)[is_strong], np.concatenate(found)[is_strong]
+    for n in np.flatnonzero(places[:, 3]):
+        while places[n, 3]:
+            window = octave.look_up(*places[n, 1:3])
+            one = places[n : n + 1], edge_threshold, keypoints[n : n + 1]
+            scale_space.refine_all(window.levels, window.origin, octave.shape, *one)
+    keypoints = keypoints[keypoints[:, 3] >= threshold]
+    keypoints = keypoints[np.lexsort((keypoints[:, 2], keypoints[:, 0], keypoints[:, 1]))]
     # two neighbours may have moved to the same place
-    is_new = np.ones(len(found), bool)
-    is_new[1:] = np.any(found[1:] != found[:-1], axis=1)
-    return found[is_new]
+    is_new = np.ones(len(keypoints), bool)
+    is_new[1:] = np.any(keypoints[1:] != keypoints[:-1], axis=1)
+    return keypoints[is_new]
+
+
+def _search(
+    octave: Octave, coarser: Octave, start: float
+) -> Iterator[tuple[Window, NDArray[np.int32], NDArray[np.float32]]]:
+    """Extrema (N, 4) and (N,) of an octave with a window that has them: all at once if it is whole."""
+    rows = np.zeros((scale_space.NUM_ROWS_AT_WORK, scale_space.PITCH), np.float32)
+    marks = np.empty(scale_space.PITCH, np.int64)
+    found = []
+    for window in octave.windows_to_search():
+        octave.hand_down(window, coarser)
+        found.append(_extrema(window, octave.shape[0], start, rows, marks))
+        if not octave.is_whole:
+            yield window, *found.pop()
+    if octave.is_whole:
+        yield window, np.concatenate([place for place, _ in found]), np.concatenate([value for _, value in found])
+
+
+def _extrema(
+    window: Window, height: int, start: float, rows: NDArray[np.float32], marks: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Extrema of the rows that are a window's own: (N, 4) layer, row, column, rounds of refinement, and (N,) values."""
+    first, last = max(window.rows[0], scale_space.BORDER), min(window.rows[1], height - scale_space.BORDER)
+    capacity = max(256, (last - first) * window.levels[0].shape[1] // 64)
+    while True:
+        place, value = np.empty((capacity, 4), np.int32), np.empty(capacity, np.float32)
+        span = window.origin[0], first, last
+        count = scale_space.find_extrema(window.levels, span, start, rows, marks, place, value)
+        if count <= capacity:
+            return place[:count], value[:count]
+        capacity = count
 
 
 def _choose(
@@ -229,10 +196,26 @@ def _choose(
     return keep[np.lexsort((keep, -contrast[keep], rank >= quota))[:max_num]]
 
 
-def _orient(octave: _Octave, found: NDArray[np.float64], max_num: int) -> NDArray[np.float64]:
+def _describe(
+    octaves: list[Octave], octave_idx: NDArray[np.int64], found: NDArray[np.float64], max_num: int, num_described: int
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Orientations (N, max_num), strongest first, NaN where there are fewer, and descriptors (N, max_num, 128) of so
+    many of them."""
     angles = np.empty((len(found), max_num))
-    orient_all(octave.levels, found, max_num, angles)
-    return angles
+    descriptors = np.empty((len(found), max_num, 128), np.uint8)
+    row = np.floor(found[:, 1])
+    for i, octave in enumerate(octaves):
+        for window in octave.windows_to_describe():
+            mine = np.flatnonzero((octave_idx == i) & (row >= window.rows[0]) & (row < window.rows[1]))
+            its_angles, top = np.empty((len(mine), max_num)), window.origin[0]
+            orient_all(window.levels, top, found[mine], max_num, its_angles)
+            angles[mine] = its_angles
+            # from top to bottom, so that neighbours find each other's pixels in the cache
+            place, rank = np.nonzero(~np.isnan(its_angles[:, :num_described]))
+            out = np.empty((len(place), 128), np.uint8)
+            describe_all(window.levels, top, found[mine[place]], its_angles[place, rank], out)
+            descriptors[mine[place], rank] = out
+    return angles, descriptors
 
 
 def compile_kernels() -> None:

@@ -135,3 +135,42 @@ def total(typingctx: Any, value: Any) -> Any:
         return builder.extract_element(value, ir.Constant(llvm.I32, 0))
 
     return types.float32(value), codegen
+
+
+def _chosen(comparison: str) -> Callable[..., Any]:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(comparison, *args), *args)
+
+    return codegen
+
+
+@intrinsic
+def larger(typingctx: Any, a: Any, b: Any) -> Any:
+    """``a if a > b else b`` of each lane."""
+    return row(a, b), _chosen(">")
+
+
+@intrinsic
+def smaller(typingctx: Any, a: Any, b: Any) -> Any:
+    """``a if a < b else b`` of each lane."""
+    return row(a, b), _chosen("<")
+
+
+def _lanes_where(comparison: str) -> Callable[..., Any]:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bits = builder.bitcast(builder.fcmp_ordered(comparison, *args), ir.IntType(WIDTH))
+        return builder.zext(bits, llvm.I64)
+
+    return codegen
+
+
+@intrinsic
+def where_above(typingctx: Any, a: Any, b: Any) -> Any:
+    """Whole number with bit n set where lane n has ``a > b``."""
+    return types.intp(a, b), _lanes_where(">")
+
+
+@intrinsic
+def where_at_least(typingctx: Any, a: Any, b: Any) -> Any:
+    """Whole number with bit n set where lane n has ``a >= b``."""
+    return types.intp(a, b), _lanes_where(">=")

@@ -353,7 +353,8 @@ def _pyramid(image: Bytes) -> list[Floats]:
             half = (image.shape[1] // 2, image.shape[0] // 2)
             image = cv2.resize(image[: 2 * half[1], : 2 * half[0]], half, interpolation=cv2.INTER_AREA)
         blurred = np.empty(image.shape, np.float32)
-        scale_space.blur(image.astype(np.float32), taps, np.empty(image.shape[1] + 2 * len(taps), np.float32), blurred)
+        line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
+        scale_space.blur(image.astype(np.float32), taps, line, blurred, (0, len(image), len(image)), (0, 0))
         levels.append(blurred)
     return levels
 

@@ -12,7 +12,7 @@ from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.features.extract import extract_image
-from sfmapp.features.sift import Scratch
+from sfmapp.features.octaves import Scratch
 from sfmapp.formats.colmap import read_model
 from sfmapp.formats.database import Database
 from sfmapp.images.image_set import ImageRecord, ImageSet
