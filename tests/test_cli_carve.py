@@ -175,18 +175,26 @@ def test_nothing_is_carved_through_the_hole_of_a_mask(photographs: Path, tmp_pat
     assert kept["surface"]["volume"] < 0.95 * report["surface"]["volume"]
 
 
-def test_a_turned_camera_is_named(photographs: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "turned"
+@pytest.mark.parametrize("kind", ["turned", "moved"])
+def test_a_camera_that_contradicts_all_others_is_named_and_carves_nothing(
+    photographs: Path, tmp_path: Path, kind: str
+) -> None:
+    folder = tmp_path / kind
     shutil.copytree(photographs, folder)
     document = json.loads((folder / "cameras.json").read_text())
     camera = document["cameras"][4]
-    turn = rigid3.rotation_matrix(np.array([0.0, np.sin(np.radians(2.5)), 0.0, np.cos(np.radians(2.5)), 0, 0, 0]))
-    camera["R_w2c"] = (turn @ camera["R_w2c"]).tolist()
-    camera["t_w2c"] = (turn @ camera["t_w2c"]).tolist()
+    if kind == "turned":
+        turn = rigid3.rotation_matrix(np.array([0.0, np.sin(np.radians(2.5)), 0.0, np.cos(np.radians(2.5)), 0, 0, 0]))
+        camera["R_w2c"] = (turn @ camera["R_w2c"]).tolist()
+        camera["t_w2c"] = (turn @ camera["t_w2c"]).tolist()
+    else:  # into the middle of the object
+        camera["t_w2c"] = [0.05, 0.0, 0.1]
     (folder / "cameras.json").write_text(json.dumps(document))
     assert carve(folder, "-o", tmp_path / "c") == 0
     report = json.loads((tmp_path / "c" / "report.json").read_text())
-    assert any(VIEWS[4].name in line["message"] for line in report["warnings"])
+    assert [mask["name"] for mask in report["masks"]["masks"] if mask["problem"]] == [VIEWS[4].name]
+    assert any(VIEWS[4].name in line["message"] and "carves nothing" in line["message"] for line in report["warnings"])
+    assert report["surface"]["volume"] > VOLUME
 
 
 def test_damaged_octrees_are_named(tmp_path: Path) -> None:

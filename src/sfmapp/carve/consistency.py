@@ -2,11 +2,12 @@
 
 A pixel inside a silhouette is right only if something on its ray is inside the others: the ray of one that two others
 call empty wherever they see it shows no object, a spill. A hole is doubtful if nothing but it is against an object as
-thick there as around it. A camera that is turned moves its silhouette: one side spills, the other lacks what all others
-hold, and both go when it is moved back (Hernandez, Schmitt and Cipolla, "Silhouette Coherence for Camera Calibration
-under Circular Motion", 2007, adjust cameras by that).
+thick there as around it. A camera that is turned or moved, or a mask of something else, contradicts the others' outer
+tangents (:mod:`sfmapp.carve.tangency`). Where these cannot tell, as objects that go on beyond the pictures have none,
+one side of its silhouette spills, the other lacks what all others hold, and both go when it is moved back (Hernandez,
+Schmitt and Cipolla, "Silhouette Coherence for Camera Calibration under Circular Motion", 2007, adjust cameras by that).
 
-All is counted on a grid of cells, coarse against the pixels; what is smaller than a cell and a margin is not judged.
+Volumes are a grid of cells, coarse against the pixels; what is smaller than a cell and a margin is not judged by them.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from sfmapp.carve.box import find_box
 from sfmapp.carve.consistency_kernels import MOST, Fields, count_misses, free_depth, see_cells
 from sfmapp.carve.outlines import Silhouette, signed_distance
+from sfmapp.carve.tangency import Contradicted, Tangents, are_in_agreement, find_contradicted, is_contradictory
 from sfmapp.carve.views import View, project_points
 from sfmapp.errors import InputError
 from sfmapp.events import Events
@@ -68,6 +70,7 @@ class Verdict:
         spilled, filled: share of its pixels that were taken away, and that were added.
         doubtful: share of holes that may be none and were left.
         turned_deg: by what its camera seems to be turned; None if it is not.
+        turned_sigma_deg: standard deviation of that; None where outer tangents do not tell it.
     """
 
     silhouette: Silhouette
@@ -76,6 +79,7 @@ class Verdict:
     filled: float = 0.0
     doubtful: float = 0.0
     turned_deg: float | None = None
+    turned_sigma_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -128,10 +132,33 @@ def compare(
     """
     verdicts = [Verdict(silhouette) for silhouette in silhouettes]
     used = [i for i, each in enumerate(silhouettes) if each.known is None or bool(each.known.any())]
+    tangents = Tangents(views, silhouettes)
     if len(used) < FEWEST:
+        if is_contradictory(tangents, used):
+            events.warned(STAGE, f"silhouettes contradict each other: {len(used)} are too few to tell which is wrong")
         return verdicts
-    out: dict[int, Verdict] = {}
     most = max(1, len(used) // 10)
+    contradicted, agree = find_contradicted(tangents, used, most)
+    for each in contradicted:
+        verdicts[each.view] = _against(silhouettes[each.view], each)
+    _judge_by_volume(views, silhouettes, used, verdicts, most, repairs=repairs, workers=workers, events=events)
+    kept = [i for i in used if not verdicts[i].problem]
+    if not agree and not are_in_agreement(Tangents(views, [verdict.silhouette for verdict in verdicts]), kept):
+        events.warned(
+            STAGE,
+            "outer tangents of silhouettes contradict each other, and it may be one as well as another: masks or "
+            "cameras of several are wrong, and what they carve away may be there: none is blamed",
+        )
+    return verdicts
+
+
+def _judge_by_volume(
+    views: Sequence[View], silhouettes: Sequence[Silhouette], used: Sequence[int], verdicts: list[Verdict], most: int,
+    *, repairs: bool, workers: int, events: Events,
+) -> None:  # fmt: skip
+    """Verdicts on those of the used views that have no problem yet, by what all of these hold; ``most`` in all may have
+    one."""
+    out = {i: verdicts[i] for i in used if verdicts[i].problem}
     while True:
         voices = [out[i].silhouette if i in out else silhouette for i, silhouette in enumerate(silhouettes)]
         try:
@@ -139,7 +166,7 @@ def compare(
             box = find_box(views, voices)
         except InputError as reason:
             events.warned(STAGE, f"silhouettes are not compared: {reason}")
-            return verdicts
+            return
         low, side = box.cube()
         out |= {
             i: Verdict(_unknown(silhouettes[i]), "is apart from all others") for i in used if views[i].name in box.apart
@@ -150,18 +177,34 @@ def compare(
         if odd is None:
             break
         if len(out) >= most:
-            events.warned(STAGE, f"cameras and silhouettes disagree, and not only {_names(views, out)}: none is blamed")
-            return verdicts
+            named = _names(views, [*out, kept[odd[0]]])
+            events.warned(
+                STAGE, f"cameras and silhouettes disagree, and not only {named}: of these none more is blamed"
+            )
+            return
         out[kept[odd[0]]] = Verdict(_unknown(silhouettes[kept[odd[0]]]), odd[1], turned_deg=odd[2])
     holes = _Holes([views[i] for i in kept], [silhouettes[i] for i in kept], low, side)
     for k, (i, found) in enumerate(zip(kept, evidence, strict=True)):
         verdicts[i] = _repaired(silhouettes[i], found, *holes.doubtful_ones(k), repairs)
     for i, verdict in out.items():
         verdicts[i] = verdict
-    return verdicts
 
 
-def _names(views: Sequence[View], which: Sequence[int] | dict[int, Verdict]) -> str:
+def _against(silhouette: Silhouette, found: Contradicted) -> Verdict:
+    """Of a view that outer tangents speak against."""
+    if found.turned_deg is None:
+        problem = (
+            f"contradicts the others in {found.share:.0%} of its outer tangents: its camera, or its mask, is wrong"
+        )
+    else:
+        problem = (
+            f"does not fit the others: its camera seems turned by {found.turned_deg:.1f} +- {found.sigma_deg:.1f} "
+            "degrees"
+        )
+    return Verdict(_unknown(silhouette), problem, turned_deg=found.turned_deg, turned_sigma_deg=found.sigma_deg)
+
+
+def _names(views: Sequence[View], which: Sequence[int]) -> str:
     return ", ".join(views[i].name for i in which)
 
 

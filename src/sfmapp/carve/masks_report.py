@@ -22,6 +22,7 @@ class PhotographMask(Report):
         spilled, filled: share of the silhouette that was taken away, and filled, as the others speak against it.
         doubtful: share of holes that may be none, and were left.
         turned_deg: angle by which its camera seems to be turned; absent where it does not.
+        turned_sigma_deg: standard deviation of that; absent where it is not known.
     """
 
     name: str
@@ -35,6 +36,7 @@ class PhotographMask(Report):
     filled: float
     doubtful: float
     turned_deg: float | None = None
+    turned_sigma_deg: float | None = None
 
 
 class MasksReport(Report):

@@ -319,7 +319,8 @@ def _compared(
     for (_, entry), verdict in zip(found, verdicts, strict=True):
         told = replace(
             entry, spilled=verdict.spilled, filled=verdict.filled, doubtful=verdict.doubtful,
-            turned_deg=verdict.turned_deg, problem=entry.problem or verdict.problem,
+            turned_deg=verdict.turned_deg, turned_sigma_deg=verdict.turned_sigma_deg,
+            problem=entry.problem or verdict.problem,
         )  # fmt: skip
         if verdict.problem:
             warnings.append(f"{entry.name} {verdict.problem}")

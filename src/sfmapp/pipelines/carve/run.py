@@ -225,10 +225,12 @@ def _box(what: CarveInput, source: CarveSource, silhouettes: Sequence[Silhouette
                 f"{_corner(found.low)} and {_corner(found.high)}",
             )
         found = given
-    inside = cameras_inside(found, source.views)
-    if len(inside) > 0.5 * len(source.views):
+    # those that were left out carve nothing, wherever they are
+    used = [v for v, each in zip(source.views, silhouettes, strict=True) if each.known is None or each.known.any()]
+    inside = cameras_inside(found, used)
+    if len(inside) > 0.5 * len(used):
         raise InputError(
-            f"{len(inside)} of {len(source.views)} cameras stand inside the volume: an object is carved from outside",
+            f"{len(inside)} of {len(used)} cameras stand inside the volume: an object is carved from outside",
             "check that masks show the object and not the background, take photographs from more sides, or give its "
             "box: --box X Y Z X Y Z",
         )
