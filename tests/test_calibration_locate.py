@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.camera_files.photographs import Photograph
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError, NoReconstructionError, UsageError
-from sfmapp.formats.colmap import read_model
 from sfmapp.formats.known_points import read_known_points, read_marker_places, read_marks
 from sfmapp.geometry import p3p, pnp, resection, rigid3
 from sfmapp.pipelines.calibration.known_points import MeasureSource, measure_marks
@@ -477,25 +475,3 @@ def test_commands_say_what_is_missing(desk, tmp_path, capsys) -> None:
     assert "sfmapp:" in capsys.readouterr().err
     with pytest.raises(UsageError, match="sigma_px"):
         measure_marks(points, MeasureSource(), sigma_px=-1.0)
-
-
-def test_a_photograph_is_located_in_a_reconstruction_that_it_is_not_of(photos, sample, tmp_path, capsys) -> None:
-    """Six of seven photographs are reconstructed, the seventh finds its place among them."""
-    names = sorted(path.name for path in photos.iterdir())
-    (tmp_path / "six").mkdir()
-    for name in names[:3] + names[4:]:
-        (tmp_path / "six" / name).write_bytes((photos / name).read_bytes())
-    assert main(["reconstruct", str(tmp_path / "six"), "-o", str(tmp_path / "out"), "-q", "--no-recording"]) == 0
-    model, _ = read_model(tmp_path / "out" / "sparse" / "0")
-    located = run(
-        capsys, "locate", photos / names[3], "--model", tmp_path / "out", "--camera", tmp_path / "out" / "sparse" / "0",
-        "-o", tmp_path / "where",
-    )["fit"]  # fmt: skip
-    assert located["num_used"] > 30
-    cameras = json.loads((sample / "cameras.json").read_text(encoding="utf-8"))["cameras"]
-    truth = {Path(entry["file"]).stem: np.array(entry["R_w2c"]) for entry in cameras}
-    ours = rigid3.rotation_matrix(np.array(located["pose"]["cam_from_world"]))
-    for i in model.registered_idx:
-        turn = ours @ rigid3.rotation_matrix(model.cam_from_world[i]).T
-        true_turn = truth[Path(names[3]).stem] @ truth[Path(model.image_names[i]).stem].T
-        assert rigid3.rotation_angle_deg(turn @ true_turn.T) < 0.5

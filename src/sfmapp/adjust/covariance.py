@@ -434,7 +434,7 @@ def errors_in_gauge(
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
     images = covariances.image_idx
-    wanted = _moved_to_gauge(estimate, ground_truth, images, covariances.num_gauge)
+    wanted = moved_to_gauge(estimate, ground_truth, images, covariances.num_gauge)
     intrinsics = [
         (estimate.cameras[c].params - ground_truth.cameras[c].params)[free]
         for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)
@@ -447,11 +447,11 @@ def pose_errors_in_gauge(
     estimate: Reconstruction, ground_truth: Reconstruction, image_idx: NDArray[np.int64], num_gauge: int
 ) -> Array:
     """(n, 6) errors of the poses of images (n,) alone, as of :func:`errors_in_gauge`."""
-    wanted = _moved_to_gauge(estimate, ground_truth, image_idx, num_gauge)
+    wanted = moved_to_gauge(estimate, ground_truth, image_idx, num_gauge)
     return _pose_errors(estimate.cam_from_world[image_idx], wanted.cam_from_world[image_idx])
 
 
-def _moved_to_gauge(
+def moved_to_gauge(
     estimate: Reconstruction, ground_truth: Reconstruction, images: NDArray[np.int64], freedoms: int
 ) -> Reconstruction:
     """The ground truth, moved to where this module's gauge compares it with the estimate."""

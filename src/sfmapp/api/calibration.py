@@ -185,13 +185,15 @@ def locate(
     sigma_px: float | None = None,
     events: Events | None = None,
 ) -> LocateResult:
-    """Find where a photograph was taken, from points with known places in it or from a reconstruction.
+    """Find where a photograph was taken, from points with known places in it.
+
+    :func:`locate_photographs` finds photographs in a reconstruction.
 
     Args:
         photograph: a file.
         output: a new folder, an empty one, or that of an earlier call: ``pose.json`` and the report.
         camera: a calibration file of any form; one of ours brings its covariance along.
-        points: as for :func:`calibrate_target`, four or more; or the folder of a reconstruction, whose points count.
+        points: as for :func:`calibrate_target`, four or more.
         dictionary: of the markers, where the points are such.
         sigma_px: standard deviation of a marked coordinate; None: as the residuals tell.
         events: told of decisions and warnings.
@@ -238,10 +240,8 @@ def compare_cameras(first: FilePath, second: FilePath) -> Comparison:
 
 
 def _point_source(points: FilePath, dictionary: str | None) -> PointSource:
-    """Where points are from: a folder is a model, and a table one of markers where they have a dictionary."""
+    """Where points are from: a table is one of markers where they have a dictionary."""
     from sfmapp.pipelines.calibration.known_points import PointSource
 
     path = Path(points)
-    if path.is_dir():
-        return PointSource(model=path)
     return PointSource(points=path) if dictionary is None else PointSource(markers=path, dictionary=dictionary)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Rows
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.dense.mesh import MeshResult
     from sfmapp.pipelines.evaluate import EvaluateOptions, Evaluation
     from sfmapp.pipelines.panorama import PanoramaResult
+    from sfmapp.pipelines.sparse.locate import LocatedResult
     from sfmapp.pipelines.undistort import UndistortResult
     from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
     from sfmapp.report.validation import Validation
@@ -225,6 +227,43 @@ def refine(
         events=events,
     )
     return TrackResult(_with_views(found), report)
+
+
+def locate_photographs(
+    photographs: FilePath | Rows[FilePath],
+    model: FilePath,
+    output: FilePath | None = None,
+    *,
+    camera: str | None = None,
+    events: Events | None = None,
+) -> LocatedResult:
+    """Find where photographs were taken in a finished reconstruction, which stays as it is.
+
+    Args:
+        photographs: a file, several, a folder or a glob pattern.
+        model: the folder of a reconstruction.
+        output: a new folder, an empty one, or that of an earlier call, for report and poses; None: nothing is written.
+        camera: of the photographs, as ``images.camera``, where it is none of the model's. None: the model's, where EXIF
+            or the size says so, or else as EXIF says, or searched.
+        events: told of progress and warnings, and can ask to stop.
+
+    Returns:
+        ``photographs``, one for each: ``cam_from_world`` (7,) in the model's world, ``covariance`` (6, 6) over rotation
+        in radians and translation, ``center_covariance`` (3, 3), the points that agree; or ``reason``, where it is not
+        located. ``report`` has the same in plain values, with the seconds that each took.
+
+    Raises:
+        UsageError: an output that holds something else.
+        InputError: there is no photograph, or the folder holds no reconstruction with its features.
+        NoReconstructionError: it holds no model.
+        InterruptedRunError: ``events`` was asked to stop.
+
+    Example:
+        >>> sfmapp.locate_photographs("new.jpg", "out/").photographs[0].cam_from_world
+    """
+    from sfmapp.pipelines.sparse.locate import locate_photographs as pipeline
+
+    return pipeline(photographs, model, output, camera=camera, events=events)
 
 
 def densify(

@@ -330,20 +330,22 @@ def _fit(
     warnings: Sequence[str],
 ) -> FitReport:  # fmt: skip
     view, covariance, noise = found
-    pose, of_pose = view.cam_from_world, covariance[-POSE:, -POSE:]
-    rotation = rigid3.rotation_matrix(pose)
-    # of C = -R^T t: the turn is about the camera and does not move it
-    center = rotation.T @ of_pose[3:, 3:] @ rotation
     return FitReport(
         photograph=facts.photograph, model=view.camera.model.name, width=view.camera.width, height=view.camera.height,
-        pose=PoseReport(
-            cam_from_world=pose.tolist(), center=rigid3.center(pose).tolist(),
-            sigma_rotation_deg=np.degrees(np.sqrt(np.diag(of_pose)[:3])).tolist(),
-            sigma_center=np.sqrt(np.diag(center)).tolist(), unit=facts.unit,
-        ),
-        points=list(points), num_used=int(view.is_used.sum()),
-        rms_px=float(np.sqrt(view.squares / max(view.is_used.sum(), 1))), noise_px=noise.sigma_px,
-        noise_source=noise.source, degrees_of_freedom=view.degrees_of_freedom, method=method, warnings=list(warnings),
+        pose=pose_report(view.cam_from_world, covariance[-POSE:, -POSE:], facts.unit), points=list(points),
+        num_used=int(view.is_used.sum()), rms_px=float(np.sqrt(view.squares / max(view.is_used.sum(), 1))),
+        noise_px=noise.sigma_px, noise_source=noise.source, degrees_of_freedom=view.degrees_of_freedom, method=method,
+        warnings=list(warnings),
+    )  # fmt: skip
+
+
+def pose_report(cam_from_world: Array, covariance: Array, unit: str) -> PoseReport:
+    """A pose (7,) in plain values, with covariance (6, 6) over turn and shift of the camera's frame."""
+    center = rigid3.center_covariance(cam_from_world, covariance)
+    return PoseReport(
+        cam_from_world=cam_from_world.tolist(), center=rigid3.center(cam_from_world).tolist(),
+        sigma_rotation_deg=np.degrees(np.sqrt(np.diag(covariance)[:3])).tolist(),
+        sigma_center=np.sqrt(np.diag(center)).tolist(), unit=unit,
     )  # fmt: skip
 
 
@@ -400,14 +402,22 @@ class KnownPose:
 
 
 def write_pose(
-    path: Path, view: OneView, covariance: Array, sigma_px: float, facts: PhotographFacts, xyz: Array
+    path: Path, pose: tuple[Camera, Array, Array], sigma_px: float, facts: PhotographFacts, xyz: Array
 ) -> None:
-    """Write ``pose.json``; covariance (P + 6, P + 6). Raises InputError if it cannot be written."""
+    """Write ``pose.json``.
+
+    Args:
+        pose: a camera, its cam_from_world (7,), and the covariance (P + 6, P + 6) of both.
+        sigma_px: of a mark. facts, xyz: of the points, (N, 3).
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    camera, cam_from_world, covariance = pose
     document = PoseDocument(
-        format=FORMAT, photograph=facts.photograph, model=view.camera.model.name, width=view.camera.width,
-        height=view.camera.height, params=view.camera.params.tolist(), cam_from_world=view.cam_from_world.tolist(),
-        covariance=covariance.tolist(), sigma_px=sigma_px, unit=facts.unit,
-        places=dict(zip(facts.names, xyz.tolist(), strict=True)),
+        format=FORMAT, photograph=facts.photograph, model=camera.model.name, width=camera.width, height=camera.height,
+        params=camera.params.tolist(), cam_from_world=cam_from_world.tolist(), covariance=covariance.tolist(),
+        sigma_px=sigma_px, unit=facts.unit, places=dict(zip(facts.names, xyz.tolist(), strict=True)),
     )  # fmt: skip
     write_document(path, document)
 

@@ -19,6 +19,7 @@ from sfmapp.georeference.world_frame import Georeference
 from sfmapp.planes.report import RectifyReport, WarpReport
 from sfmapp.report.carve_document import CarveReport
 from sfmapp.report.evaluation import EvaluationReport
+from sfmapp.report.located_html import LocatedReport
 from sfmapp.report.masks_html import MaskFilesReport
 from sfmapp.report.model import (
     CalibrateReport,
@@ -41,9 +42,9 @@ from sfmapp.reporting import Report, field_types
 from sfmapp.stereo.design import DesignReport
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
-# calibrate, locate, pair, panorama, warp, rectify, stereo, carve, masks and sweep; calibration.json;
-# validation/report.json and validation/cloud.json; what evaluate, undistort, export, measure and stereo-design print
-# with --json; and georeference.json
+# calibrate, locate (of points, in a model), pair, panorama, warp, rectify, stereo, carve, masks and sweep;
+# calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort, export, measure and
+# stereo-design print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
     "dense": DenseRunReport,
@@ -61,6 +62,7 @@ KINDS: Mapping[str, type[Report]] = {
     "calibrate-target": TargetReport,
     "calibrate-targets": TargetsReport,
     "locate": LocationReport,
+    "locate-model": LocatedReport,
     "measure": MeasureReport,
     "pair": PairReport,
     "panorama": PanoramaReport,

@@ -22,12 +22,13 @@ WIDTH, HEIGHT = 1000.0, 560.0
 MAX_POINTS = 4000
 
 
-def top_view_svg(model: Reconstruction, orientation: Sequence[int] | None = None) -> str:
+def top_view_svg(model: Reconstruction, orientation: Sequence[int] | None = None, *, new: int = 0) -> str:
     """Points in their colours and cameras as triangles, seen along the mean downward direction of the images.
 
     Args:
         model: of I images.
         orientation: EXIF orientations of the images; None: all are upright as they are stored.
+        new: how many of the last images are drawn in blue, as they came to the others later.
     """
     registered = model.registered_idx
     poses = model.cam_from_world
@@ -51,7 +52,8 @@ def top_view_svg(model: Reconstruction, orientation: Sequence[int] | None = None
     for i, idx in enumerate(registered):
         corners = np.array([[0, 0], forward[i] - 0.5 * right[i], forward[i] + 0.5 * right[i]]) * size + centers[i]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in to_page(corners))
-        parts.append(f'<polygon points="{path}"><title>{escape(model.image_names[idx])}</title></polygon>')
+        fill = ' fill="#2f6fd1aa"' if idx >= len(model.image_names) - new else ""
+        parts.append(f'<polygon points="{path}"{fill}><title>{escape(model.image_names[idx])}</title></polygon>')
     style = 'stroke-linecap="round" stroke-width="2.2" fill="#d1372c66"'
     return f'<svg viewBox="0 0 {WIDTH:.0f} {HEIGHT:.0f}" {style}>{"".join(parts)}</svg>'
 

@@ -57,8 +57,12 @@ class Score:
     def is_contradicted(self) -> bool:
         """More is missing than what is hidden or has changed in a right place: as much by chance once in a hundred
         places."""
+        return self.is_contradicted_beyond(_CHANGED)
+
+    def is_contradicted_beyond(self, share: float) -> bool:
+        """The same where another share of the clusters of a right place is hidden or has changed."""
         n, m = self.num_clusters, self.num_missing
-        fewer = sum(math.comb(n, k) * _CHANGED**k * (1 - _CHANGED) ** (n - k) for k in range(m))
+        fewer = sum(math.comb(n, k) * share**k * (1 - share) ** (n - k) for k in range(m))
         return 1.0 - fewer < _CHANCE
 
 

@@ -38,7 +38,6 @@ from sfmapp.formats.known_points import read_known_points, read_marker_places, r
 from sfmapp.images.folder import describe_images
 from sfmapp.images.image_set import ImageOptions, ImageRecord
 from sfmapp.images.pixels import read_gray, read_rgb
-from sfmapp.pipelines.calibration.model_points import find_model_points
 from sfmapp.pipelines.calibration.results import write_camera, write_recording
 from sfmapp.report.point_html import draw_residuals, render_location_html, render_target_html
 from sfmapp.reporting import document_text
@@ -59,14 +58,12 @@ class PointSource:
     Attributes:
         points: a table of ``[name] X Y Z u v``. markers: one of ``id corner X Y Z``.
         dictionary: of the markers.
-        model: a folder of ``sfmapp reconstruct`` whose points the photograph shows; for ``locate``.
         is_opencv: pixels of the table count the centre of the first pixel as 0, as OpenCV does, not as a half.
     """
 
     points: Path | None = None
     markers: Path | None = None
     dictionary: str | None = None
-    model: Path | None = None
     is_opencv: bool = False
 
 
@@ -138,7 +135,10 @@ def calibrate_from_target(
         folder = job.workspace.folder
         files = write_camera(folder, fit.calibration(record.name), Path(record.name).stem)
         report = target_report(fit, points.facts, files)
-        write_pose(folder / POSE_FILE, fit.view, fit.whole_covariance, fit.noise.sigma_px, points.facts, points.xyz)
+        write_pose(
+            folder / POSE_FILE, (fit.view.camera, fit.view.cam_from_world, fit.whole_covariance), fit.noise.sigma_px,
+            points.facts, points.xyz,
+        )  # fmt: skip
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
         _write(job.workspace, picture[0], render_target_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
@@ -174,18 +174,17 @@ def locate(
     given, covariance = read_camera(camera, record)
     with Job.opened(LOCATE, photograph, output, None, events=events) as job:
         job.note_inputs({record.name: record.digest})
-        if source.model is None:
-            points = read_points(record, source, job.events)
-        else:
-            names, xyz, xy = find_model_points(source.model, record, given, job.events)
-            points = PhotographPoints(PhotographFacts(record.name, names, "units"), xyz, xy)
+        points = read_points(record, source, job.events)
         found = locate_camera(
             points.xyz, points.xy, given, method=search.method, max_error_px=search.max_error_px, sigma_px=sigma_px,
             camera_covariance=covariance,
         )  # fmt: skip
         folder = job.workspace.folder
         report = location_report(found, points.facts, points.xy)
-        write_pose(folder / POSE_FILE, found.view, found.covariance, found.noise.sigma_px, points.facts, points.xyz)
+        write_pose(
+            folder / POSE_FILE, (found.view.camera, found.view.cam_from_world, found.covariance), found.noise.sigma_px,
+            points.facts, points.xyz,
+        )  # fmt: skip
         picture = draw_residuals(read_rgb(record), record.orientation, report.fit.points)
         _write(job.workspace, picture[0], render_location_html(report, picture), document_text(report))
         _tell(report.fit.warnings, job.events)
@@ -306,7 +305,6 @@ def check_sigma(sigma_px: float | None) -> None:
 
 
 def describe_photograph(photograph: str | os.PathLike[str]) -> ImageRecord:
-    """What a file is. Raises InputError if it is no photograph."""
     """One photograph. Raises InputError if it cannot be used."""
     path = Path(photograph)
     records, reasons = describe_images(path.parent, [path.name], ImageOptions())

@@ -156,7 +156,10 @@ def _write(
         fit = location_report(found, one.facts, one.xy).fit
         fits.append(fit)
         pose = folder / POSES / f"{Path(record.name).stem}.json"
-        write_pose(pose, found.view, found.covariance, found.noise.sigma_px, one.facts, one.xyz)
+        write_pose(
+            pose, (found.view.camera, found.view.cam_from_world, found.covariance), found.noise.sigma_px, one.facts,
+            one.xyz,
+        )  # fmt: skip
         if len(pictures) < _MAX_PICTURES:
             pictures.append(draw_residuals(read_rgb(record), record.orientation, fit.points))
     report = targets_report(made, fits, files)
