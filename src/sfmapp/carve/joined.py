@@ -55,7 +55,8 @@ _BAND_PX, _BAND_CELLS = 2.0, 2.0
 _STEP = 0.28
 # iterations by level: a coarse level has the large areas to move, a fine one only what a cell of the coarser one is
 _ITERATIONS, _FEWEST_ITERATIONS = 320, 40
-# how often what is left is held to the silhouettes at each level: what is put back may lay bare what lies behind
+# How often what is left is held to the silhouettes at each level: what is put back may lay bare what lies behind. Each
+# level starts anew: coarse ones lose thin parts, and put back more for them than silhouettes need.
 _ROUNDS = 3
 # a pixel is uncovered so far inside its outline, in pixels beside the width of a cell
 _MARGIN_PX = 1.0
@@ -96,7 +97,8 @@ class JoinReport(Report):
         num_sights: photographs that see patches.
         band: within which distances to patches are averaged, units of the world.
         hull_volume, volume: of the hull and of what is left of it, cubic units of the world.
-        filled_share: of the nodes in the hull near the surface, those that were put back for silhouettes.
+        filled_share: of the nodes in the hull near the surface, those that were put back for silhouettes at the finest
+            level.
     """
 
     cells: int
@@ -304,7 +306,6 @@ def _begin(number: int, above: _Level | None, cube: _Cube, hull: Hull, pool: Thr
         other = above.find((places + 1) >> 1)
         at, other = np.where(at >= 0, at, other), np.where(other >= 0, other, at)
         level.value = 0.5 * (above.value[at] + above.value[other])
-        level.extra = np.maximum(above.extra[at], above.extra[other])
     beyond = np.where(level.value > 0.0, FULL, EMPTY)
     for axis in range(3):
         step = np.eye(3, dtype=np.int64)[axis]
