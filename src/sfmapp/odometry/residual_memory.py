@@ -16,10 +16,12 @@ Array = NDArray[np.float64]
 
 
 class Correlation(NamedTuple):
-    """Of the residuals of a frame with those of the frame before it, and of the one before that; NaN of none."""
+    """Of the residuals of a frame with those of the frame before it, and of the one before that; and the share of its
+    points that the frame before did not see. NaN of none."""
 
     with_last: float
     with_one_before: float
+    renewed: float = float("nan")
 
 
 NOT_KNOWN = Correlation(float("nan"), float("nan"))
@@ -38,8 +40,12 @@ class ResidualMemory:
     def look(self, point_id: NDArray[np.integer], residual: Array) -> Correlation:
         """Remember the residuals (N, 2) of a frame at its points (N,), and compare them with those before."""
         found = [self._correlation(point_id, residual, *before) for before in self._before]
+        renewed = float("nan")
+        if self._before and len(point_id):
+            renewed = 1.0 - len(np.intersect1d(point_id, self._before[0][0])) / len(point_id)
         self._before = [(point_id, residual), *self._before[:1]]
-        return Correlation(*[*found, float("nan"), float("nan")][:2])
+        with_last, with_one_before = [*found, float("nan"), float("nan")][:2]
+        return Correlation(with_last, with_one_before, renewed)
 
     @staticmethod
     def _correlation(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import project
 from sfmapp.events import Events
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Frame, Sequence
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks
 from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
@@ -62,7 +62,7 @@ class _Tracked:
         previous: pyramid of the last frame; None before the first.
         num_mapped_at_keyframe: how many were mapped when the newest keyframe was made.
         covariance: (6, 6) of the pose given the map; not finite where it was not measured.
-        map_moved: (7,) see :class:`~sfmapp.odometry.snapshot.FrameSnapshot`, since the last frame was told of.
+        map_moved: (8,) see :class:`~sfmapp.odometry.snapshot.FrameSnapshot`, since the last frame was told of.
         residual_px: standard deviation of the points that measured it, a coordinate.
     """
 
@@ -72,8 +72,19 @@ class _Tracked:
     previous: Pyramid | None = None
     num_mapped_at_keyframe: int = 0
     covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
-    map_moved: Array = field(default_factory=rigid3.IDENTITY.copy)
+    map_moved: Array = field(default_factory=similarity.IDENTITY.copy)
     residual_px: float = 0.0
+
+    def move_map(self, moved: Array) -> None:
+        """The map below the camera has moved by a similarity (8,), as of ``map_moved``."""
+        self.map_moved = similarity.compose(self.map_moved, moved)
+
+    def stay_in_map(self, pose: Array, zoom: float) -> None:
+        """The map was put elsewhere, and its lengths are so many times longer: the camera has another pose (7,) in it,
+        and is where it was."""
+        seen = similarity.compose(np.append(rigid3.IDENTITY, 1.0 / zoom), np.append(pose, 1.0))
+        self.move_map(similarity.compose(np.append(rigid3.inverse(self.pose), 1.0), seen))
+        self.pose = pose
 
     def drop_tracks(self) -> None:
         """Nothing is followed any more."""
@@ -170,7 +181,7 @@ class Odometry:
             record.correlation, self.tracked.map_moved, record.map_idx, record.cpu_s, latency_s,
             None if belief is None or belief.num_looks == num_looks else belief.state(),
         )  # fmt: skip
-        self.tracked.map_moved = rigid3.IDENTITY
+        self.tracked.map_moved = similarity.IDENTITY
         self.events.advanced(STAGE, message=frame.name, snapshot=snapshot)
         return record
 
@@ -344,8 +355,10 @@ class Odometry:
             return
         self.rig, pose = local.rig, local.pose(local.newest)
         record.give_out(pose)
-        self.motion.rescale(float(np.linalg.norm(pose[4:]) / max(float(np.linalg.norm(before[4:])), 1e-300)))
-        self.tracked.pose, self.tracked.tracks = pose, local.tracks_of_newest()
+        zoom = float(np.linalg.norm(pose[4:]) / max(float(np.linalg.norm(before[4:])), 1e-300))
+        self.motion.rescale(zoom)
+        self.tracked.stay_in_map(pose, zoom)
+        self.tracked.tracks = local.tracks_of_newest()
         self._count_mapped()
         self._tell("the images contradict the given calibration: going on with a refined one", everything=True)
 
@@ -366,7 +379,7 @@ class Odometry:
         if local.backend.finish(local.keyframes, number):
             moved = rigid3.compose(rigid3.inverse(before), local.pose(local.newest))
             self.tracked.pose = rigid3.compose(self.tracked.pose, moved)
-            self.tracked.map_moved = rigid3.compose(self.tracked.map_moved, moved)
+            self.tracked.move_map(np.append(moved, 1.0))
 
     def _count_mapped(self) -> None:
         assert self.local is not None
@@ -471,7 +484,8 @@ class Odometry:
         for number in {closure.old_map, closure.new_map}:
             maps[number].backend.finish(maps[number].keyframes)
         self.local, scale = self.recognition.close(maps, self.records, closure)
-        self.tracked.pose, self.tracked.tracks = self.local.pose(self.local.newest), self.local.tracks_of_newest()
+        self.tracked.stay_in_map(self.local.pose(self.local.newest), scale)
+        self.tracked.tracks = self.local.tracks_of_newest()
         self.motion.rescale(scale)
         # the newest frame is given out after this: in the world, and with the unit, that those after it have as well
         self.records[-1].give_out(self.tracked.pose)

@@ -48,8 +48,8 @@ class FrameSnapshot:
         cam_from_world: (7,) pose as it was given out, NaN without one.
         covariance: (6, 6) of the pose given the map, over rotation (radians) and translation of
             ``x_cam <- exp(w) x_cam + v``; NaN where it was not measured.
-        map_moved: (7,) how adjustments have moved the map below the camera since the frame before: a place x of now was
-            at map_moved(x).
+        map_moved: (8,) how adjustments and loops have moved the map below the camera since the frame before, and
+            changed its unit: a place x of now was at map_moved(x).
         correlation: how far the frame's residuals are those of the frames before it; NaN where nobody filters.
         map_idx: which map the pose is in, counted from 0 in the order in which they began.
         cpu_s: CPU seconds of tracking, back end not included.

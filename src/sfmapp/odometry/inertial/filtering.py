@@ -4,12 +4,7 @@ Each sample of the sensor moves the state on, each pose with its covariance corr
 nothing. Sola, "Quaternion kinematics for the error-state Kalman filter", arXiv 1711.02508, 2017, sections 5 and 6; a
 sample is integrated, and its slopes taken, by the preintegration of :mod:`sfmapp.odometry.inertial.integration`.
 
-The state is that of the sensor: position in the world, rotation world_from_imu, velocity in the world, the biases of
-gyroscope and accelerometer, and gravity in the world, which a map knows to its own accuracy only; and how far the map
-has drifted from that world: shift, rotation and scale. Poses of neighbouring frames err together, as they see the same
-points, and a map that is made with them keeps their errors: taken for new in each frame, they would make innovations
-too small and the pose too sure (cf. Roumeliotis and Burdick, "Stochastic cloning", ICRA 2002). The error state (25,)
-has all in that order, the rotation's on the right, R exp(dtheta), that of the drift on the left, exp(dphi) C.
+What the state is, and how it errs, is in :mod:`sfmapp.odometry.inertial.filter_state`.
 
 Without a sensor the filter of :mod:`sfmapp.odometry.inertial.smoothing` takes its place: the camera goes on as it
 moves.
@@ -17,19 +12,18 @@ moves.
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.inertial.filter_state import INDEPENDENT, FilterState, InertialSensor, Shared
 from sfmapp.odometry.inertial.gyroscope import MAX_SILENCE_S
-from sfmapp.odometry.inertial.integration import ACCEL_BIAS_SIGMA, GRAVITY, GYRO_BIAS_SIGMA, integrate
 from sfmapp.odometry.inertial.smoothing import (
     SmoothingOptions,
     compile_kernels,
@@ -40,59 +34,14 @@ from sfmapp.odometry.inertial.smoothing import (
 )
 from sfmapp.odometry.report import FilterConsistency
 
-if TYPE_CHECKING:
-    from sfmapp.images.sequence import Imu
-
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Where the parts of the error state are.
-_P, _R, _V, _BG, _BA, _G, _CP, _CR = (slice(3 * k, 3 * k + 3) for k in range(8))
-_S, _C = slice(24, 25), slice(18, 25)
-_SIZE = 25
-_ROWS = np.arange(_SIZE)
-# Gravity is 9.78 to 9.83 m/s^2 from place to place.
-_GRAVITY_SIGMA = 0.02
 # Frames further apart than so many times their usual distance have lost some between them.
 _DROPPED = 1.5
 LIVE = SmoothingOptions(max_gap_s=5.0, is_causal=True)
 """Only the past counts, and gaps of up to five seconds are bridged."""
-
-
-@dataclass(frozen=True)
-class InertialSensor:
-    """Measurements, and what is known of the sensor before the first pose.
-
-    Attributes:
-        imu: on the clock of the poses, mounted as it is.
-        gravity: (3,) m/s^2 in the world of the poses, which is in metres; it points down. gravity_sigma_rad: of its
-            direction.
-        gyro_bias, accel_bias: (3,) rad/s and m/s^2, uncertain by what biases of small sensors may be.
-        scale_sigma: relative standard deviation of the unit of length of the poses; 0: they are in metres.
-    """
-
-    imu: Imu
-    gravity: Array
-    gravity_sigma_rad: float
-    gyro_bias: Array
-    accel_bias: Array
-    scale_sigma: float = 0.0
-
-
-class Shared(NamedTuple):
-    """How the errors of poses hang together in time, as shares of their covariance.
-
-    Attributes:
-        white: what is new in each frame and gone in the next.
-        walk: what is new in each frame and stays, as the map is made with it: variance added from frame to frame.
-    """
-
-    white: float
-    walk: float
-
-
-INDEPENDENT = Shared(1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -244,9 +193,11 @@ class InertialFilter:
     """
 
     def __init__(self, sensor: InertialSensor, speed: float, options: SmoothingOptions = LIVE) -> None:
-        self._options, self._start = options, _State(sensor, speed)
-        self._anchor: _State | None = None  # at the last frame, which was used or not; None: begins with the next pose
-        self._head: _State | None = None  # at the newest sample
+        self._options, self._start = options, FilterState(sensor, speed)
+        self._anchor: FilterState | None = (
+            None  # at the last frame, which was used or not; None: begins with the next pose
+        )
+        self._head: FilterState | None = None  # at the newest sample
         self._anchor_s = self._head_s = self._used_s = -math.inf
         self._samples: list[_Sample] = []  # from the last one before the anchor on
         self._in_a_row, self._is_waiting, self._interval_s = 0, False, math.inf
@@ -273,15 +224,15 @@ class InertialFilter:
 
     def add_frame(
         self, timestamp_s: float, pose: tuple[Array, Array, Array] | None, shared: Shared = INDEPENDENT,
-        map_moved: Array = rigid3.IDENTITY,
+        map_moved: Array = similarity.IDENTITY,
     ) -> None:  # fmt: skip
         """Correct by a frame, later than those before it.
 
         Args:
             pose: centre (3,), rotation world_from_cam (3, 3) and their covariance (6, 6); None of a frame without.
             shared: how far its error is that of the frames before.
-            map_moved: (7,) a place x of the map was at map_moved(x) in the frame before: what an adjustment has changed
-                is no motion, and the sensor knew nothing of it.
+            map_moved: (8,) a place x of the map was at map_moved(x) in the frame before: what an adjustment or a loop
+                has changed is no motion, and the sensor knew nothing of it.
         """
         begin = time.perf_counter()
         self._frame_s.append(timestamp_s)
@@ -304,6 +255,25 @@ class InertialFilter:
         self._hold(at_frame, timestamp_s)
         self._note(at_frame, timestamp_s, not is_used, begin)
 
+    @property
+    def start_sigmas(self) -> tuple[float, float]:
+        """Of the unit of length, relative, and of the direction of gravity, radians; infinite before the first pose."""
+        state = self._anchor
+        return (math.inf, math.inf) if state is None else (state.scale_sigma, state.tilt_sigma_rad)
+
+    def settle(self) -> None:
+        """Take what came so far for the start: the last frame is the first row, and its map is the world."""
+        if self._anchor is None:
+            return
+        begin = time.perf_counter()
+        state, now = self._anchor, self._anchor_s
+        state.take_map_for_world()
+        for kept in (self._nis, self._is_rejected, self._frame_s):
+            del kept[:-1]
+        self._rows.clear()
+        self._hold(state, now)
+        self._note(state, now, self._is_waiting, begin)
+
     def result(self) -> FilteredTrajectory:
         """All rows in the order of time, out of the filter's order of the error state."""
         rows = sorted(self._rows, key=lambda row: row.timestamp_s)
@@ -325,7 +295,7 @@ class InertialFilter:
 
     def _begin_at(self, timestamp_s: float, pose: tuple[Array, Array, Array], shared: Shared, begin: float) -> None:
         state = self._start.copied()
-        state.begin(pose[0], pose[1], shared.white * pose[2])
+        state.begin(*pose, shared)
         self._used_s, self._in_a_row, self._is_waiting = timestamp_s, 0, False
         self._hold(state, timestamp_s)
         self._note(state, timestamp_s, False, begin)
@@ -342,7 +312,7 @@ class InertialFilter:
             return False
         return timestamp_s - self._samples[-1].timestamp_s <= MAX_SILENCE_S
 
-    def _hold(self, state: _State, timestamp_s: float) -> None:
+    def _hold(self, state: FilterState, timestamp_s: float) -> None:
         """Go on from a state at the time of a frame, and take what came since then with it."""
         self._anchor, self._anchor_s = state, timestamp_s
         before = [n for n, sample in enumerate(self._samples) if sample.timestamp_s <= timestamp_s]
@@ -353,7 +323,7 @@ class InertialFilter:
             self._go_through(self._head, timestamp_s, newest)
             self._head_s = newest
 
-    def _go_through(self, state: _State, start_s: float, stop_s: float) -> None:
+    def _go_through(self, state: FilterState, start_s: float, stop_s: float) -> None:
         """Move a state on by the samples in between."""
         between = [sample.timestamp_s for sample in self._samples if start_s < sample.timestamp_s < stop_s]
         for now, then in itertools.pairwise([start_s, *between, stop_s]):
@@ -376,10 +346,10 @@ class InertialFilter:
         value: Array = first + share * (second - first)
         return value
 
-    def _correct(self, state: _State, pose: tuple[Array, Array, Array], shared: Shared) -> bool:
+    def _correct(self, state: FilterState, pose: tuple[Array, Array, Array], shared: Shared) -> bool:
         """By the pose of a frame, if the motion does not contradict it."""
         center, rotation, noise = pose
-        state.drift(shared.walk * noise)
+        state.drift(shared, noise, center)
         noise = shared.white * noise
         innovation = state.innovation(center, rotation)
         self._nis[-1] = state.nis(innovation, noise)
@@ -393,161 +363,7 @@ class InertialFilter:
         state.correct(innovation, noise)
         return True
 
-    def _note(self, state: _State, now: float, is_bridged: bool, begin: float) -> None:
+    def _note(self, state: FilterState, now: float, is_bridged: bool, begin: float) -> None:
         rotation, center, covariance = state.camera()
         spent = time.perf_counter() - begin
         self._rows.append(_Row(now, rotation, center, covariance, now - self._used_s, is_bridged, spent))
-
-
-class _State:
-    """Where the sensor is believed to be, how far the map has drifted below it, and how sure that is.
-
-    Args:
-        speed: standard deviation of a velocity of which nothing is known, m/s.
-    """
-
-    def __init__(self, sensor: InertialSensor, speed: float) -> None:
-        imu, down = sensor.imu, sensor.gravity / np.linalg.norm(sensor.gravity)
-        self._imu_from_cam, self._arm = rigid3.rotation_matrix(imu.imu_from_cam), imu.imu_from_cam[4:]
-        self._noises = np.array([imu.gyro_noise, imu.accel_noise, imu.gyro_walk, imu.accel_walk]) ** 2
-        self._speed, self._delta = speed, np.empty(60)
-        self.position, self.rotation, self.velocity = np.zeros(3), np.eye(3), np.zeros(3)
-        self.gyro_bias, self.accel_bias, self._gravity = sensor.gyro_bias, sensor.accel_bias, sensor.gravity
-        # a place in the world is at scale turn x + shift in the map, whose unit was said to be a metre
-        self._shift, self._turn, self._log_scale = np.zeros(3), np.eye(3), 0.0
-        self._scale_sigma = sensor.scale_sigma
-        self._p = np.zeros((_SIZE, _SIZE))
-        self._p[_BG, _BG], self._p[_BA, _BA] = GYRO_BIAS_SIGMA**2 * np.eye(3), ACCEL_BIAS_SIGMA**2 * np.eye(3)
-        along = np.outer(down, down)
-        tilt = GRAVITY * sensor.gravity_sigma_rad
-        self._p[_G, _G] = tilt**2 * (np.eye(3) - along) + _GRAVITY_SIGMA**2 * along
-        self._p[_S, _S] = sensor.scale_sigma**2
-
-    def copied(self) -> _State:
-        """Another that goes its own way from here."""
-        other = copy.copy(self)
-        other._p, other._delta = self._p.copy(), np.empty(60)
-        return other
-
-    def begin(self, center: Array, rotation: Array, noise: Array) -> None:
-        """At a pose of the camera (centre, world_from_cam and their covariance), with any velocity. The world is that
-        of the map as it is now."""
-        self._shift, self._turn = np.zeros(3), np.eye(3)
-        self.rotation = rotation @ self._imu_from_cam.T
-        self.position = center / math.exp(self._log_scale) - self.rotation @ self._arm
-        self.velocity = np.zeros(3)
-        known = np.r_[_BG, _BA, _G, _S]
-        kept = self._p[np.ix_(known, known)]
-        self._p[:] = 0.0
-        self._p[np.ix_(known, known)] = kept
-        # another unit of length would not move the camera from where it is
-        here = self._in_map()[:, None]
-        self._p[_CP], self._p[:, _CP] = -here @ self._p[_S], -self._p[:, _S] @ here.T
-        self._p[_CP, _CP] = here @ self._p[_S, _S] @ here.T
-        back = np.linalg.inv(self._measurement()[:, :6])
-        self._p[:6, :6] = back @ noise @ back.T
-        self._p[_V, _V] = self._speed**2 * np.eye(3)
-
-    def move_map(self, moved: Array) -> None:
-        """The map was put elsewhere: a place x of it was at moved(x). The camera stays."""
-        back = rigid3.inverse(moved)
-        turn = rigid3.rotation_matrix(back)
-        self._turn, self._shift = turn @ self._turn, turn @ self._shift + back[4:]
-        # the errors of the drift are along the axes of the map
-        change = np.eye(_SIZE)
-        change[_CP, _CP] = change[_CR, _CR] = turn
-        self._p = change @ self._p @ change.T
-
-    def drift(self, walk: Array) -> None:
-        """The map errs otherwise than at the last frame, here by a covariance (6, 6) of the centre and of the rotation
-        in the camera's frame; what was mapped before stays as it was."""
-        in_map, rotation = self._in_map(), self._turn @ self.rotation @ self._imu_from_cam
-        spread = np.zeros((7, 6))
-        spread[:3, :3], spread[:3, 3:], spread[3:6, 3:] = np.eye(3), rigid3.skew(in_map) @ rotation, rotation
-        grown = spread @ walk @ spread.T
-        if self._scale_sigma > 0.0:
-            # new points are as far wrong along their rays as across them, as a share of their depths
-            size = float(np.trace(walk[3:, 3:])) / 3.0
-            grown[6, 6] += size
-            grown[:3, :3] += size * np.outer(in_map, in_map)
-            grown[:3, 6] -= size * in_map
-            grown[6, :3] -= size * in_map
-        self._p[_C, _C] += grown
-
-    def predict(self, step: Array) -> None:
-        """On by a step (7,) of the sensor: duration, mean rate and mean force."""
-        h, delta, r = float(step[0]), self._delta, self.rotation
-        integrate(step[None], self.gyro_bias, delta)
-        slope = delta[15:].reshape(5, 3, 3)
-        velocity = delta[9:12] + slope[2] @ self.accel_bias
-        moved = delta[12:15] + slope[4] @ self.accel_bias
-        turn, f = delta[:9].reshape(3, 3), np.eye(_SIZE)
-        f[_P, _R], f[_V, _R] = -r @ rigid3.skew(moved), -r @ rigid3.skew(velocity)
-        f[_R, _R], f[_R, _BG] = turn.T, slope[0]
-        f[_V, _BG], f[_V, _BA], f[_P, _BG], f[_P, _BA] = r @ slope[1], r @ slope[2], r @ slope[3], r @ slope[4]
-        for k in range(3):
-            f[k, 6 + k], f[k, 15 + k], f[6 + k, 15 + k] = h, 0.5 * h * h, h
-        self._p = f @ self._p @ f.T
-        gyro, accel, gyro_walk, accel_walk = self._noises * h
-        moving = _ROWS[: _G.start]
-        self._p[moving, moving] += np.repeat([accel * h * h / 3.0, gyro, accel, gyro_walk, accel_walk], 3)
-        for k in range(3):
-            self._p[k, 6 + k] += accel * h / 2.0
-            self._p[6 + k, k] += accel * h / 2.0
-        self.position = self.position + self.velocity * h + 0.5 * h * h * self._gravity + r @ moved
-        self.velocity = self.velocity + h * self._gravity + r @ velocity
-        self.rotation = r @ turn
-
-    def _in_map(self) -> Array:
-        """(3,) where the camera's centre is in the map, the shift left out."""
-        y: Array = math.exp(self._log_scale) * self._turn @ (self.position + self.rotation @ self._arm)
-        return y
-
-    def _measurement(self) -> Array:
-        """(6, 25) slopes of the camera's centre in the map and of its rotation, in its own frame."""
-        h, size = np.zeros((6, _SIZE)), math.exp(self._log_scale)
-        h[:3, _P], h[:3, _R] = size * self._turn, -size * self._turn @ self.rotation @ rigid3.skew(self._arm)
-        h[3:, _R] = self._imu_from_cam.T
-        in_map = self._in_map()
-        h[:3, _CP], h[:3, _CR], h[:3, 24] = np.eye(3), -rigid3.skew(in_map), in_map
-        h[3:, _CR] = (self._turn @ self.rotation @ self._imu_from_cam).T
-        return h
-
-    def camera(self) -> tuple[Array, Array, Array]:
-        """Rotation world_from_cam (3, 3), centre (3,) and their covariance (6, 6)."""
-        h = np.zeros((6, _SIZE))
-        h[:3, _P], h[:3, _R] = np.eye(3), -self.rotation @ rigid3.skew(self._arm)
-        h[3:, _R] = self._imu_from_cam.T
-        center = self.position + self.rotation @ self._arm
-        return self.rotation @ self._imu_from_cam, center, h @ self._p @ h.T
-
-    def innovation(self, center: Array, rotation: Array) -> Array:
-        """(6,) what a measured pose says beyond the state."""
-        ours = self._turn @ self.rotation @ self._imu_from_cam
-        return np.concatenate([center - self._in_map() - self._shift, rigid3.log_so3(ours.T @ rotation)])
-
-    def nis(self, innovation: Array, noise: Array) -> float:
-        """Normalised innovation squared."""
-        h = self._measurement()
-        return float(innovation @ np.linalg.solve(h @ self._p @ h.T + noise, innovation))
-
-    def correct(self, innovation: Array, noise: Array) -> None:
-        """Kalman's update, the covariance in Joseph's form."""
-        h = self._measurement()
-        gain = np.linalg.solve(h @ self._p @ h.T + noise, h @ self._p).T
-        step, keep = gain @ innovation, np.eye(_SIZE) - gain @ h
-        self._p = keep @ self._p @ keep.T + gain @ noise @ gain.T
-        self._p = 0.5 * (self._p + self._p.T)
-        self.position, self.velocity = self.position + step[_P], self.velocity + step[_V]
-        self.rotation = rigid3.rotation_matrix(rigid3.quaternion(self.rotation @ rigid3.exp_so3(step[_R])))
-        self.gyro_bias, self.accel_bias = self.gyro_bias + step[_BG], self.accel_bias + step[_BA]
-        self._gravity = self._gravity + step[_G]
-        turn = rigid3.exp_so3(step[_CR])
-        self._turn, self._shift = turn @ self._turn, self._shift + step[_CP]
-        self._log_scale += float(step[24])
-
-    def forget(self, innovation: Array) -> None:
-        """The motion jumped: what was predicted says little about where and how fast."""
-        squares = [(innovation[:3] ** 2).sum(), (innovation[3:] ** 2).sum(), self._speed**2]
-        moving = _ROWS[: _BG.start]
-        self._p[moving, moving] += np.repeat(squares, 3)

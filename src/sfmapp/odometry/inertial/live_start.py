@@ -12,13 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.odometry.inertial.filtering import InertialSensor
+from sfmapp.odometry.inertial.filter_state import InertialSensor
 from sfmapp.odometry.inertial.gyroscope import read_as_given
 from sfmapp.odometry.inertial.integration import (
-    ACCEL_BIAS_SIGMA,
-    GRAVITY,
     InertialOptions,
-    LinearStart,
     choose_poses,
     constrain,
     gyro_bias_of,
@@ -37,6 +34,8 @@ Array = NDArray[np.float64]
 SHORTEST_S, LONGEST_S, STEP_S = 2.5, 10.0, 0.5
 # The filter is linear about where it begins.
 _MAX_SCALE_SIGMA, _MAX_TILT_RAD = 0.15, float(np.radians(5.0))
+# What the alignment is believed to: it says where to begin, not how sure that is.
+_ANY_SCALE_SIGMA, _ANY_TILT_RAD = 0.3, float(np.radians(10.0))
 _OPTIONS = InertialOptions(max_poses=100)
 
 
@@ -81,38 +80,24 @@ def start_of(times: Array, poses: Array, imu: Imu, *, is_metric: bool) -> Start 
     found = constrain(*system, is_metric)
     if not found.inverse_scale > 0.0:
         return "the motion does not tell the scale"
-    scale_sigma, tilt = _sigmas(system[0], found, float(np.ptp(times[chosen])), is_metric)
-    if not (scale_sigma <= _MAX_SCALE_SIGMA and tilt <= _MAX_TILT_RAD):
-        return f"the motion tells the scale to {scale_sigma:.0%} and where down is to {np.degrees(tilt):.0f} degrees"
-    sensor = InertialSensor(imu, found.gravity, tilt, gyro_bias, found.accel_bias, scale_sigma)
+    # the accelerometer's bias is what the filter takes it for: that of the alignment hangs on gravity's
+    scale_sigma = 0.0 if is_metric else _ANY_SCALE_SIGMA
+    sensor = InertialSensor(imu, found.gravity, _ANY_TILT_RAD, gyro_bias, np.zeros(3), scale_sigma)
     return Start(sensor, 1.0 / found.inverse_scale, offset)
 
 
-def _sigmas(design: Array, found: LinearStart, duration_s: float, is_metric: bool) -> tuple[float, float]:
-    """Relative standard deviation of the scale, and that of the direction of gravity in radians."""
-    x = np.concatenate([[1.0], found.gravity, found.accel_bias])
-    basis = np.linalg.svd(found.gravity[None])[2][1:].T
-    rho = found.inverse_scale
-    slopes = np.concatenate(
-        [(design @ x)[..., None] * rho, rho * GRAVITY * design[..., 1:4] @ basis, rho * design[..., 4:]], -1
+def why_too_early(scale_sigma: float, tilt_sigma_rad: float) -> str:
+    """Why a filter that has gone through the first seconds had better wait; empty: it had not."""
+    if scale_sigma <= _MAX_SCALE_SIGMA and tilt_sigma_rad <= _MAX_TILT_RAD:
+        return ""
+    return (
+        f"the motion tells the scale to {scale_sigma:.0%} and where down is to {np.degrees(tilt_sigma_rad):.0f} degrees"
     )
-    slopes = slopes[..., 1:] if is_metric else slopes
-    size = slopes.shape[2]
-    # spans of a second begin at every pose: those in the same second are told the same
-    repeated = max(1.0, len(design) / max(duration_s, 1.0))
-    information = np.einsum("nki,nkj->ij", slopes, slopes) / (repeated * found.position_sigma**2)
-    information[-3:, -3:] += np.eye(3) / ACCEL_BIAS_SIGMA**2
-    try:
-        variance = np.diag(np.linalg.inv(information))
-    except np.linalg.LinAlgError:
-        return float("inf"), float("inf")
-    tilt = float(np.sqrt(variance[size - 5 : size - 3].max()))
-    return (0.0 if is_metric else float(np.sqrt(variance[0]))), tilt
 
 
 def in_metres(poses: Array, scale: float) -> Array:
-    """Poses (N, 7) of another unit of length."""
-    return np.concatenate([poses[..., :4], scale * poses[..., 4:]], -1)
+    """Poses (..., 7), or similarities (..., 8), in another unit of length."""
+    return np.concatenate([poses[..., :4], scale * poses[..., 4:7], poses[..., 7:]], -1)
 
 
 def until(imu: Imu, timestamp_s: float) -> Imu:

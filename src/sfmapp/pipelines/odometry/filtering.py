@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -11,16 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Event, Events
+from sfmapp.geometry import similarity
 from sfmapp.images.sequence import Imu
+from sfmapp.odometry.inertial.filter_state import INDEPENDENT, Shared
 from sfmapp.odometry.inertial.filtering import (
     LIVE,
     FilteredTrajectory,
     InertialFilter,
-    Shared,
     consistency,
     filter_trajectory,
 )
-from sfmapp.odometry.inertial.live_start import LONGEST_S, SHORTEST_S, STEP_S, in_metres, start_of, until
+from sfmapp.odometry.inertial.live_start import (
+    LONGEST_S,
+    SHORTEST_S,
+    STEP_S,
+    in_metres,
+    start_of,
+    until,
+    why_too_early,
+)
 from sfmapp.odometry.inertial.scale import scale_covariance
 from sfmapp.odometry.inertial.smoothing import read_measured
 from sfmapp.odometry.report import FilterGap, FilterReport, RejectedPose
@@ -34,6 +44,9 @@ COLUMNS = ("timestamp_s", "position_sigma", "rotation_sigma_deg", "since_pose_s"
 _FORGET = 0.95
 # What is new in every frame is at least the noise of its own pixels, a small part of all.
 _LEAST_WHITE = 0.02
+# How far a frame is believed to have more of that than others, where its own residuals say so: what walks on is no
+# steadier than what is new, and of three numbers of about the same variance only one sum is known.
+_OWN = 0.5
 # Of a velocity of which nothing is known, m/s: whatever carries a camera.
 _UNKNOWN_SPEED = 10.0
 
@@ -41,12 +54,13 @@ _UNKNOWN_SPEED = 10.0
 class SharedErrors:
     """How live poses err together, by what the residuals of neighbouring frames have in common.
 
-    With correlations r1 over one frame and r2 over two, errors that partly are new in each frame and partly walk on
-    with the map have 1 - r = white + walk n / 2 over n frames.
+    Errors that partly are new in each frame, and partly walk on with the map at a rate that lasts, have over n frames
+    the correlation r with 1 - r = white + (walk n + (walk n)^2) / 2, as long as the rate is the same
+    (:meth:`~sfmapp.odometry.inertial.filter_state.FilterState.drift`); white and walk follow from n = 1 and 2.
     """
 
     def __init__(self) -> None:
-        self._sums, self._weight = np.zeros(2), 0.0
+        self._sums, self._weight, self._last_white = np.zeros(3), 0.0, _LEAST_WHITE
 
     def add(self, frame: FrameSnapshot) -> Shared:
         """Learn from a frame; what is known by then."""
@@ -54,10 +68,16 @@ class SharedErrors:
         if np.isfinite(found).all():
             self._sums, self._weight = _FORGET * self._sums + found, _FORGET * self._weight + 1.0
         if self._weight == 0.0:
-            return Shared(1.0, 0.0)
-        r1, r2 = (self._sums / self._weight).tolist()
-        white = min(1.0, max(_LEAST_WHITE, 1.0 - 2.0 * r1 + r2))
-        return Shared(white, 2.0 * max(0.0, min(r1 - r2, 1.0 - r1)))
+            return INDEPENDENT
+        r1, r2, renewed = (self._sums / self._weight).tolist()
+        walk = (math.sqrt(1.0 + 24.0 * max(0.0, min(r1 - r2, 1.0 - r1))) - 1.0) / 6.0
+        usual = 1.0 - 2.0 * r1 + r2 + walk**2
+        white = usual
+        if np.isfinite(found[0]):
+            # 1 - r1 has half of what is new in the frame, and half of what was in the one before it
+            white += _OWN * (2.0 * (1.0 - float(found[0])) - walk - walk**2 - self._last_white - usual)
+        self._last_white = min(1.0, max(_LEAST_WHITE, white))
+        return Shared(self._last_white, walk, renewed)
 
 
 @dataclass
@@ -75,6 +95,7 @@ class _MapFilter:
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     shares: list[Shared] = field(default_factory=list)
+    moved: list[Array] = field(default_factory=list)
     first: int = 0
     inertial: InertialFilter | None = None
     scale: float = 1.0
@@ -121,42 +142,51 @@ class LiveFilter:
         now.poses.append(frame.cam_from_world)
         now.covariances.append(frame.covariance)
         now.shares.append(shared)
-        if self._imu is not None and (now.inertial is not None or (has_pose and self._begins(now, self._imu))):
-            moved = in_metres(frame.map_moved, now.scale)
-            self._go_on(now, self._imu, shared, moved)
+        now.moved.append(frame.map_moved)
+        if self._imu is None:
+            return
+        if now.inertial is not None:
+            self._go_on(now, now.inertial, self._imu, len(now.times_s) - 1)
+        elif has_pose:
+            self._begin(now, self._imu)
 
-    def _begins(self, now: _MapFilter, imu: Imu) -> bool:
-        """Look for a start in the last seconds, once in a while."""
+    def _begin(self, now: _MapFilter, imu: Imu) -> None:
+        """Look for a start in the last seconds, once in a while, and go through them: what the filter knows at their
+        end, and how sure it is, follows from the poses and their covariances as it does later."""
         times = np.array(now.times_s)
         if times[-1] - times[0] < SHORTEST_S or times[-1] - now.tried_s < STEP_S:
-            return False
+            return
         now.tried_s = float(times[-1])
-        recent = times >= times[-1] - LONGEST_S
-        poses = np.array(now.poses)[recent]
-        found = start_of(times[recent], poses, until(imu, now.tried_s), is_metric=self._is_metric)
+        recent = np.flatnonzero(times >= times[-1] - LONGEST_S)
+        found = start_of(times[recent], _in_last_map(now, recent), until(imu, now.tried_s), is_metric=self._is_metric)
         if isinstance(found, str):
             now.reason = found
-            return False
-        now.inertial = InertialFilter(found.sensor, _UNKNOWN_SPEED)
-        now.scale, now.clock_offset_s, now.reason = found.scale, found.clock_offset_s, ""
-        now.first = len(times) - 1
+            return
+        now.scale, now.clock_offset_s = found.scale, found.clock_offset_s
+        measured = [int(n) for n in recent if np.isfinite(now.covariances[n]).all()]
+        first = next((n for n in measured if now.shares[n] is not INDEPENDENT), measured[0])
         # the last samples before the frame tell the first after it
-        after = int(np.searchsorted(imu.timestamps_s - now.clock_offset_s, now.tried_s, "right"))
+        after = int(np.searchsorted(imu.timestamps_s - now.clock_offset_s, times[first], "right"))
         now.next_sample = max(0, after - 2)
-        return True
+        inertial = InertialFilter(found.sensor, _UNKNOWN_SPEED)
+        for n in range(first, len(times)):
+            self._go_on(now, inertial, imu, n)
+        now.reason = why_too_early(*inertial.start_sigmas)
+        if not now.reason:
+            inertial.settle()
+            now.inertial, now.first = inertial, len(times) - 1
 
-    def _go_on(self, now: _MapFilter, imu: Imu, shared: Shared, map_moved: Array) -> None:
+    def _go_on(self, now: _MapFilter, inertial: InertialFilter, imu: Imu, n: int) -> None:
         """The samples until a frame, and the frame."""
-        assert now.inertial is not None
-        frame_s, times = now.times_s[-1], imu.timestamps_s
+        frame_s, times = now.times_s[n], imu.timestamps_s
         while now.next_sample < len(times) and times[now.next_sample] - now.clock_offset_s <= frame_s:
-            n = now.next_sample
-            now.inertial.add_sample(float(times[n] - now.clock_offset_s), imu.gyro[n], imu.accel[n])
+            k = now.next_sample
+            inertial.add_sample(float(times[k] - now.clock_offset_s), imu.gyro[k], imu.accel[k])
             now.next_sample += 1
         measured = read_measured(
-            [frame_s], in_metres(now.poses[-1][None], now.scale), scale_covariance(now.covariances[-1], now.scale)[None]
+            [frame_s], in_metres(now.poses[n][None], now.scale), scale_covariance(now.covariances[n], now.scale)[None]
         )
-        now.inertial.add_frame(frame_s, measured.pose(0), shared, map_moved)
+        inertial.add_frame(frame_s, measured.pose(0), now.shares[n], in_metres(now.moved[n], now.scale))
 
     def finish(self, events: Events) -> tuple[FilteredTrajectory, FilterReport] | None:
         """What was found of the map with the most poses, and what there is to say of it; None without a frame."""
@@ -173,6 +203,16 @@ class LiveFilter:
         report = _report(found, names, most.times_s[most.first :], shares, reason)
         events.decided(STAGE, _told(report), **report)
         return found, report
+
+
+def _in_last_map(now: _MapFilter, frames: NDArray[np.int64]) -> Array:
+    """(N, 7) poses of some frames, the last one among them, as the map has them now that adjustments have moved it."""
+    poses, before_from_now = np.full((len(frames), 7), np.nan), similarity.IDENTITY
+    for k in range(len(frames) - 1, -1, -1):
+        if np.isfinite(now.poses[frames[k]][0]):
+            poses[k] = similarity.transform_poses(similarity.inverse(before_from_now), now.poses[frames[k]])
+        before_from_now = similarity.compose(now.moved[frames[k]], before_from_now)
+    return poses
 
 
 def _at_constant_velocity(entry: _MapFilter) -> FilteredTrajectory:
@@ -213,7 +253,7 @@ def _report(
         for f in np.flatnonzero(found.is_rejected)
     ]  # fmt: skip
     rows = found.frame_row[found.frame_row >= 0]
-    white, walk = np.median(shares, axis=0).tolist() if len(shares) else (1.0, 0.0)
+    white, walk, _ = np.median(shares, axis=0).tolist() if len(shares) else Shared(1.0, 0.0)
     return FilterReport(
         prediction=found.prediction, num_poses=len(found.timestamps_s), rate_hz=round(rate, 3),
         num_used=int((found.since_pose_s[rows] == 0.0).sum()), rejected=rejected, gaps=list(_gaps(found)),

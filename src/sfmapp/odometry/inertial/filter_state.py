@@ -1,0 +1,319 @@
+"""What the error-state filter knows: where the sensor is in the map, and how the map lies in the world.
+
+The sensor is told by its position in the map, rotation map_from_imu, velocity in the map, the biases of gyroscope and
+accelerometer, and gravity in the axes of the map, which a map knows to its own accuracy only. Poses of neighbouring
+frames err together, as they see the same points, and a map that is made with them keeps their errors: taken for new in
+each frame, they would make innovations too small and the pose too sure (cf. Roumeliotis and Burdick, "Stochastic
+cloning", ICRA 2002). So the map drifts: a place x of the world, in which gravity stands still, is at s C x + c of the
+map, and s, C, c walk, at a rate that lasts for a while.
+
+Poses are measured in the map, and all that they correct is told in it: slopes of measurements do not hang on the state,
+but for the small lever arm. With the sensor told in the world they would, and what no pose can tell, such as where the
+map began to turn, would seem to be told by slopes that are taken here and there (Huang, Mourikis and Roumeliotis,
+"Analysis and improvement of the consistency of extended Kalman filter based SLAM", ICRA 2008); likewise the unit of
+length, by a first velocity that was zero and is not. Filters centred on the robot do the same (Castellanos, Martinez-
+Cantin, Tardos and Neira, "Robocentric map joining", Robotics and Autonomous Systems 2007).
+
+The error state (31,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, and the
+rate of the drift.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.inertial.integration import ACCEL_BIAS_SIGMA, GRAVITY, GYRO_BIAS_SIGMA, integrate
+
+if TYPE_CHECKING:
+    from sfmapp.images.sequence import Imu
+
+Array = NDArray[np.float64]
+
+# Where the parts of the error state are.
+_P, _R, _V, _BG, _BA, _G, _CP, _CR = (slice(3 * k, 3 * k + 3) for k in range(8))
+_S, _U = slice(24, 25), slice(25, 31)
+_SIZE = 31
+_ROWS = np.arange(_SIZE)
+# Gravity is 9.78 to 9.83 m/s^2 from place to place.
+_GRAVITY_SIGMA = 0.02
+# Nearer to each other than this two views tell no distance of a point, radians: the tracker asks for a degree.
+_LEAST_PARALLAX = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class InertialSensor:
+    """Measurements, and what is known of the sensor before the first pose.
+
+    Attributes:
+        imu: on the clock of the poses, mounted as it is.
+        gravity: (3,) m/s^2 in the world of the poses, which is in metres; it points down. gravity_sigma_rad: of its
+            direction.
+        gyro_bias, accel_bias: (3,) rad/s and m/s^2, uncertain by what biases of small sensors may be.
+        scale_sigma: relative standard deviation of the unit of length of the poses; 0: they are in metres.
+    """
+
+    imu: Imu
+    gravity: Array
+    gravity_sigma_rad: float
+    gyro_bias: Array
+    accel_bias: Array
+    scale_sigma: float = 0.0
+
+
+class Shared(NamedTuple):
+    """How the errors of poses hang together in time, as shares of their covariance.
+
+    Attributes:
+        white: what is new in each frame and gone in the next.
+        walk: what is new in each frame and stays, as the map is made with it: variance added from frame to frame.
+        renewed: share of the points that the frame before did not see.
+    """
+
+    white: float
+    walk: float
+    renewed: float = 0.0
+
+
+INDEPENDENT = Shared(1.0, 0.0)
+
+
+class FilterState:
+    """Where the sensor is believed to be, how far the map has drifted below it, and how sure that is.
+
+    Args:
+        speed: standard deviation of a velocity of which nothing is known, m/s.
+    """
+
+    def __init__(self, sensor: InertialSensor, speed: float) -> None:
+        imu, down = sensor.imu, sensor.gravity / np.linalg.norm(sensor.gravity)
+        self._imu_from_cam, self._arm = rigid3.rotation_matrix(imu.imu_from_cam), imu.imu_from_cam[4:]
+        self._noises = np.array([imu.gyro_noise, imu.accel_noise, imu.gyro_walk, imu.accel_walk]) ** 2
+        self._speed, self._delta = speed, np.empty(60)
+        # in the map
+        self._position, self._rotation, self._velocity = np.zeros(3), np.eye(3), np.zeros(3)
+        self.gyro_bias, self.accel_bias, self._gravity = sensor.gyro_bias, sensor.accel_bias, sensor.gravity
+        # a place x in the world is at scale turn x + shift in the map, whose unit was said to be a metre
+        self._shift, self._turn, self._log_scale = np.zeros(3), np.eye(3), 0.0
+        self._is_metric = sensor.scale_sigma == 0.0
+        self._rate = np.zeros(6)  # of the drift, a frame: of what is where the camera is, and of the rotation
+        self._behind = np.zeros(3)  # in the map, where the camera was when the points that it sees were new
+        self._p = np.zeros((_SIZE, _SIZE))
+        self._p[_BG, _BG], self._p[_BA, _BA] = GYRO_BIAS_SIGMA**2 * np.eye(3), ACCEL_BIAS_SIGMA**2 * np.eye(3)
+        along = np.outer(down, down)
+        tilt = GRAVITY * sensor.gravity_sigma_rad
+        self._p[_G, _G] = tilt**2 * (np.eye(3) - along) + _GRAVITY_SIGMA**2 * along
+        self._p[_S, _S] = sensor.scale_sigma**2
+
+    def copied(self) -> FilterState:
+        """Another that goes its own way from here."""
+        other = copy.copy(self)
+        other._p, other._delta = self._p.copy(), np.empty(60)
+        return other
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative standard deviation of the unit of length."""
+        return float(np.sqrt(self._p[24, 24]))
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """Standard deviation of the direction of gravity, about the axis of which it is the largest."""
+        size = float(np.linalg.norm(self._gravity))
+        across = np.eye(3) - np.outer(self._gravity, self._gravity) / size**2
+        return float(np.sqrt(np.linalg.eigvalsh(across @ self._p[_G, _G] @ across)[-1])) / size
+
+    # ---- the map
+
+    def begin(self, center: Array, rotation: Array, noise: Array, shared: Shared) -> None:
+        """At a pose of the camera (centre, world_from_cam and their covariance), with any velocity. The world is that
+        of the map as it is now."""
+        self._rotation = rotation @ self._imu_from_cam.T
+        self._position = center - math.exp(self._log_scale) * self._rotation @ self._arm
+        self._velocity, self._behind, self._rate = np.zeros(3), center, np.zeros(6)
+        known = np.r_[_BG, _BA, _G, _S]
+        kept = self._p[np.ix_(known, known)]
+        self._p[:] = 0.0
+        self._p[np.ix_(known, known)] = kept
+        h = self._measurement()
+        back = np.linalg.inv(h[:, :6])
+        self._p[:6, :6] = back @ (shared.white * noise) @ back.T
+        # the camera is there whatever the unit of length is
+        self._p[_P], self._p[:, _P] = (
+            self._p[_P] - h[:3, _S] @ self._p[_S],
+            self._p[:, _P] - self._p[:, _S] @ h[:3, _S].T,
+        )
+        self._p[_P, _P] += h[:3, _S] @ self._p[_S, _S] @ h[:3, _S].T
+        in_map = np.eye(6)
+        in_map[3:, 3:] = rotation
+        self._p[_U, _U] = shared.walk**2 * in_map @ noise @ in_map.T
+        self._p[_V, _V] = self._speed**2 * np.eye(3)
+        self.take_map_for_world()
+
+    def take_map_for_world(self) -> None:
+        """The world becomes that of the map as it is now, without any drift; another unit of length would not move the
+        camera from where it is."""
+        self._turn, self._shift = np.eye(3), np.zeros(3)
+        change = np.eye(_SIZE)
+        change[_CP], change[_CR] = 0.0, 0.0
+        change[_CP, _S] = -self._center()[:, None]
+        self._p = change @ self._p @ change.T
+
+    def move_map(self, moved: Array) -> None:
+        """The map was put elsewhere: a place x of it was at moved(x), a similarity (8,). The camera stays."""
+        back = similarity.inverse(moved)
+        turn, size = rigid3.rotation_matrix(back), float(back[7])
+        self._position, self._shift = similarity.apply(back, self._position), similarity.apply(back, self._shift)
+        self._behind = similarity.apply(back, self._behind)
+        self._rotation, self._turn = turn @ self._rotation, turn @ self._turn
+        self._velocity, self._gravity = size * turn @ self._velocity, turn @ self._gravity
+        self._log_scale += math.log(size)
+        rate = np.kron(np.diag([size, 1.0]), turn)
+        self._rate = rate @ self._rate
+        change = np.eye(_SIZE)
+        change[_P, _P] = change[_V, _V] = change[_CP, _CP] = size * turn
+        change[_G, _G] = change[_CR, _CR] = turn
+        change[_U, _U] = rate
+        self._p = change @ self._p @ change.T
+
+    def drift(self, shared: Shared, noise: Array, center: Array) -> None:
+        """The map errs otherwise than at the last frame; what was mapped before stays as it was.
+
+        Points are placed by the poses of the frames in which their errors are the same, 1 / walk of them. Where the way
+        of the camera over these is wrong, by as much as one pose is, what they show goes on wrong in the same sense:
+        the drift has a rate, and keeps it until no error is the same any more, 2 / walk frames.
+
+        Args:
+            noise: (6, 6) covariance of the pose, of the centre, and of the rotation in the camera's frame.
+            center: (3,) the pose's.
+        """
+        in_map = np.eye(6)
+        in_map[3:, 3:] = self._rotation @ self._imu_from_cam
+        noise = in_map @ noise @ in_map.T
+        here, turning = self._center(), rigid3.exp_so3(self._rate[3:])
+        spread = np.zeros((_SIZE, 6))
+        spread[_P, :3] = spread[_CP, :3] = np.eye(3)
+        spread[_P, 3:], spread[_CP, 3:] = -rigid3.skew(self._position - here), -rigid3.skew(self._shift - here)
+        spread[_R, 3:], spread[_CR, 3:] = self._rotation.T, np.eye(3)
+        spread[_V, 3:], spread[_G, 3:] = -rigid3.skew(self._velocity), -rigid3.skew(self._gravity)
+        step, kept = np.eye(_SIZE), max(0.0, 1.0 - 0.5 * shared.walk)
+        step[:, _U] = spread
+        step[_U, _U] = kept * np.eye(6)
+        self._p = step @ self._p @ step.T + shared.walk * spread @ noise @ spread.T
+        self._p[_U, _U] += (1.0 - kept**2) * shared.walk**2 * noise
+        self._position = here + self._rate[:3] + turning @ (self._position - here)
+        self._shift = here + self._rate[:3] + turning @ (self._shift - here)
+        self._rotation, self._turn = turning @ self._rotation, turning @ self._turn
+        self._velocity, self._gravity = turning @ self._velocity, turning @ self._gravity
+        self._rate = kept * self._rate
+        self._change_unit(shared, noise, center)
+
+    def _change_unit(self, shared: Shared, noise: Array, center: Array) -> None:
+        """Of one camera the length of the way over which points were placed is the unit of the map besides, which is
+        handed on to those that take their places; noise (6, 6) in the axes of the map."""
+        way = center - self._behind
+        self._behind = self._behind + min(shared.walk, 1.0) * way
+        if self._is_metric:
+            return
+        # points that are farther than so many times the way have no distance yet; their depth is what a pose is less
+        # sure of its place by than of its direction
+        depth2 = float(np.trace(noise[:3, :3]) / np.trace(noise[3:, 3:]))
+        length2 = float(way @ way) + depth2 * _LEAST_PARALLAX**2
+        change2 = shared.renewed * float(way @ noise[:3, :3] @ way) / length2**2
+        spread = np.zeros(_SIZE)
+        here = self._center()
+        spread[_P], spread[_V], spread[_CP], spread[_S] = self._position - here, self._velocity, self._shift - here, 1.0
+        self._p += change2 * np.outer(spread, spread)
+
+    # ---- the sensor
+
+    def predict(self, step: Array) -> None:
+        """On by a step (7,) of the sensor: duration, mean rate and mean force."""
+        h, delta, r, size = float(step[0]), self._delta, self._rotation, math.exp(self._log_scale)
+        integrate(step[None], self.gyro_bias, delta)
+        slope = delta[15:].reshape(5, 3, 3)
+        velocity = delta[9:12] + slope[2] @ self.accel_bias
+        moved = delta[12:15] + slope[4] @ self.accel_bias
+        faster = size * (h * self._gravity + r @ velocity)
+        farther = size * (0.5 * h * h * self._gravity + r @ moved)
+        turn, f, in_map = delta[:9].reshape(3, 3), np.eye(_SIZE), size * r
+        f[_P, _R], f[_V, _R] = -in_map @ rigid3.skew(moved), -in_map @ rigid3.skew(velocity)
+        f[_R, _R], f[_R, _BG] = turn.T, slope[0]
+        f[_V, _BG], f[_V, _BA] = in_map @ slope[1], in_map @ slope[2]
+        f[_P, _BG], f[_P, _BA] = in_map @ slope[3], in_map @ slope[4]
+        f[_P, 24], f[_V, 24] = farther, faster
+        for k in range(3):
+            f[k, 6 + k], f[k, 15 + k], f[6 + k, 15 + k] = h, 0.5 * h * h * size, h * size
+        self._p = f @ self._p @ f.T
+        gyro, accel, gyro_walk, accel_walk = self._noises * h
+        accel *= size * size
+        moving = _ROWS[: _G.start]
+        self._p[moving, moving] += np.repeat([accel * h * h / 3.0, gyro, accel, gyro_walk, accel_walk], 3)
+        for k in range(3):
+            self._p[k, 6 + k] += accel * h / 2.0
+            self._p[6 + k, k] += accel * h / 2.0
+        self._position = self._position + self._velocity * h + farther
+        self._velocity = self._velocity + faster
+        self._rotation = r @ turn
+
+    def _center(self) -> Array:
+        """(3,) of the camera in the map."""
+        center: Array = self._position + math.exp(self._log_scale) * self._rotation @ self._arm
+        return center
+
+    def _measurement(self) -> Array:
+        """(6, 31) slopes of the camera's centre in the map and of its rotation, in its own frame."""
+        h, size = np.zeros((6, _SIZE)), math.exp(self._log_scale)
+        h[:3, _P], h[:3, _R] = np.eye(3), -size * self._rotation @ rigid3.skew(self._arm)
+        h[:3, 24] = size * self._rotation @ self._arm
+        h[3:, _R] = self._imu_from_cam.T
+        return h
+
+    def camera(self) -> tuple[Array, Array, Array]:
+        """Rotation world_from_cam (3, 3), centre in the world (3,) and their covariance (6, 6), centre first."""
+        back, size = self._turn.T, math.exp(-self._log_scale)
+        in_map = self._rotation @ self._imu_from_cam
+        ahead = self._center() - self._shift
+        change = self._measurement()
+        change[:3, _CP], change[:3, _CR] = -np.eye(3), rigid3.skew(ahead)
+        change[:3, 24] -= ahead
+        change[:3] = size * back @ change[:3]
+        change[3:, _CR] = -in_map.T
+        return back @ in_map, size * back @ ahead, change @ self._p @ change.T
+
+    def innovation(self, center: Array, rotation: Array) -> Array:
+        """(6,) what a measured pose says beyond the state."""
+        ours = self._rotation @ self._imu_from_cam
+        return np.concatenate([center - self._center(), rigid3.log_so3(ours.T @ rotation)])
+
+    def nis(self, innovation: Array, noise: Array) -> float:
+        """Normalised innovation squared."""
+        h = self._measurement()
+        return float(innovation @ np.linalg.solve(h @ self._p @ h.T + noise, innovation))
+
+    def correct(self, innovation: Array, noise: Array) -> None:
+        """Kalman's update, the covariance in Joseph's form."""
+        h = self._measurement()
+        gain = np.linalg.solve(h @ self._p @ h.T + noise, h @ self._p).T
+        step, keep = gain @ innovation, np.eye(_SIZE) - gain @ h
+        self._p = keep @ self._p @ keep.T + gain @ noise @ gain.T
+        self._p = 0.5 * (self._p + self._p.T)
+        self._position, self._velocity = self._position + step[_P], self._velocity + step[_V]
+        self._rotation = rigid3.rotation_matrix(rigid3.quaternion(self._rotation @ rigid3.exp_so3(step[_R])))
+        self.gyro_bias, self.accel_bias = self.gyro_bias + step[_BG], self.accel_bias + step[_BA]
+        self._gravity = self._gravity + step[_G]
+        turn = rigid3.exp_so3(step[_CR])
+        self._turn, self._shift = turn @ self._turn, self._shift + step[_CP]
+        self._log_scale, self._rate = self._log_scale + float(step[24]), self._rate + step[_U]
+
+    def forget(self, innovation: Array) -> None:
+        """The motion jumped: what was predicted says little about where and how fast."""
+        squares = [(innovation[:3] ** 2).sum(), (innovation[3:] ** 2).sum(), self._speed**2]
+        moving = _ROWS[: _BG.start]
+        self._p[moving, moving] += np.repeat(squares, 3)
