@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from carving_scenes import Solid, around, ball, both, box, mask_of, ring, without
 from sfmapp.carve import consistency
 from sfmapp.carve.consistency import Verdict, compare
+from sfmapp.carve.masks_report import PhotographMask
 from sfmapp.carve.outlines import Silhouette, coverage_of_mask, signed_distance
+from sfmapp.carve.silhouettes import told_of_repairs
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
@@ -179,3 +181,23 @@ def test_views_that_disagree_as_a_whole_blame_nobody() -> None:
     found = compare(views, silhouettes, repairs=True, workers=2, events=events)
     assert not any(verdict.problem for verdict in found)
     assert any("none is blamed" in line or "not compared" in line for line in lines)
+
+
+def test_many_large_spills_are_warned_of() -> None:
+    lines: list[str] = []
+    events = Events(lambda event: lines.append(event.message) if event.kind == "warned" else None)
+    for num, is_told in ((1, False), (4, True)):
+        lines.clear()
+        masks = [
+            mask | disk(mask, 0.1, within=False, seed=i) if i < num else mask for i, mask in enumerate(MASKS["lumps"])
+        ]
+        found = compare(VIEWS, [silhouette(mask) for mask in masks], repairs=True, workers=2, events=events)
+        entries = [
+            PhotographMask(
+                name=f"{i}", source="mask", share=0.1, border_share=0.0, outline_sigma_px=0.2, is_usable=True,
+                problem="", spilled=each.spilled, filled=0.0, doubtful=0.0,
+            )
+            for i, each in enumerate(found)
+        ]  # fmt: skip
+        told_of_repairs(entries, True, events)
+        assert any("masks are bad" in line for line in lines) == is_told

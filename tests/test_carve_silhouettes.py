@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from carving_photographs import coverage_of, photograph
 from carving_scenes import around, ball, both, box
+from sfmapp.carve.backgrounds import edge_pieces
 from sfmapp.carve.graph_cut import cut_by_mask
 from sfmapp.carve.masks_report import MasksReport
 from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
@@ -187,3 +188,28 @@ def test_a_mask_of_twice_the_size_keeps_shares_of_pixels(tmp_path: Path) -> None
     images, _ = load_images(pattern, ImageOptions(mask_path=str(tmp_path / "masks")), Events())
     silhouettes, _ = find_silhouettes(images, None, MaskOptions(), Events())
     assert min(agreement(s, c) for s, c in zip(silhouettes, COVERAGES, strict=True)) > 0.999
+
+
+def test_pieces_of_the_object_at_the_edges_say_that_colours_do_not_tell_it() -> None:
+    # something of the object's colours stands in the background, and comes to the edge in some photographs
+    pictures = [picture.copy() for picture in PHOTOGRAPHS]
+    for i, picture in enumerate(pictures):
+        rows, columns = np.nonzero(COVERAGES[i] > 0.99)
+        left = 90 - 4 * i
+        width = min(12, 96 - left)
+        picture[50:65, left : left + width] = picture[np.median(rows).astype(int), np.median(columns).astype(int)]
+    silhouettes, report = found_in(pictures)
+    assert any(edge_pieces(silhouette.inside) > 0.0 for silhouette in silhouettes)
+    assert any("at the edges" in line for line in report.warnings)
+    assert not any("at the edges" in line for line in found_in(PHOTOGRAPHS)[1].warnings)
+
+
+def test_the_largest_piece_may_reach_the_edge() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[10:30, :25] = True
+    assert edge_pieces(mask) == 0.0
+    mask[20:25, 55:] = True
+    assert edge_pieces(mask) == pytest.approx(25 / 525)
+    mask[20:25, 55:] = False
+    mask[20:25, 50:55] = True
+    assert edge_pieces(mask) == 0.0

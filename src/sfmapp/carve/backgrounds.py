@@ -142,3 +142,17 @@ def _smooth_evidence(index: NDArray[np.int32], model: ColorModel) -> NDArray[np.
     import cv2
 
     return np.asarray(cv2.boxFilter(model.evidence[index], -1, (_WINDOW, _WINDOW)))
+
+
+def edge_pieces(mask: Mask) -> float:
+    """Share of a mask (H, W) in pieces apart from its largest one that reach the edge of the picture: colours are
+    learned from what is there, as the background's."""
+    import cv2
+
+    num, labels, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    if num <= 2:
+        return 0.0
+    areas = facts[:, cv2.CC_STAT_AREA]
+    at_edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    apart = at_edge[(at_edge > 0) & (at_edge != 1 + areas[1:].argmax())]
+    return float(areas[apart].sum() / areas[1:].sum())
