@@ -348,10 +348,9 @@ def test_sparse_system_equals_dense_with_any_factors(monkeypatch, per_image):
     graph.add(gtsam.PriorFactorVector(K(0), np.array([905.0, -0.07]), noise.Sigma(2, 0.5)))
     graph.add(gtsam.PriorFactorPose3(X(99), where[0], noise.Sigma(6, 1e-3)))  # an image that does not exist
     reports, states = [], []
-    for kind, limit in (("tiles", 160), ("gtsam", 160), ("gtsam", 0), ("lapack", 160), ("lapack", 0)):
+    for kind, limit in (("tiles", 160), *((kind, n) for kind in ("gtsam", "lapack", "envelope") for n in (160, 0))):
         monkeypatch.setattr(solver, "choose_solver", lambda *_, kind=kind, **__: kind)
         monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", limit)
-        monkeypatch.setattr(solver, "_DENSE_SHARE", 2.0)
         found = start_of(scene)
         reports.append(adjust_bundle(found, TIGHT, extra_factors=graph))
         states.append(found)

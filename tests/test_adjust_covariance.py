@@ -135,7 +135,6 @@ def test_sparse_tiles_give_the_same_covariances(monkeypatch):
     adjust_bundle(found, OPTIONS)
     dense = estimate_covariances(found, OPTIONS)
     monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
-    monkeypatch.setattr(solver, "_DENSE_SHARE", 2.0)
     monkeypatch.setattr(solver, "choose_solver", lambda *_, **__: "gtsam")
     sparse = estimate_covariances(found, OPTIONS)
     np.testing.assert_allclose(dense.poses, sparse.poses, rtol=1e-4, atol=1e-12)

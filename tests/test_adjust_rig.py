@@ -163,7 +163,6 @@ def test_sparse_equals_dense_and_threads_change_nothing(monkeypatch):
         results.append(found.cam_from_world.tobytes() + found.point_xyz.tobytes())
     assert results[0] == results[1]
     monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
-    monkeypatch.setattr(solver, "_DENSE_SHARE", 2.0)
     monkeypatch.setattr(solver, "choose_solver", lambda *_, **__: "gtsam")
     sparse = start_of(scene)
     assert adjust_bundle(sparse, KNOWN).solver == "gtsam"

@@ -6,12 +6,10 @@ import numpy as np
 
 from sfmapp.adjust.clustered import clustered_covariances
 from sfmapp.adjust.covariance import estimate_covariances
-from sfmapp.adjust.kernels import find_slot
-from sfmapp.adjust.linear import mark_pairs, number_keys
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.adjust.problem import Varying
-from sfmapp.adjust.solver import adjust_bundle, make_engine
+from sfmapp.adjust.solver import adjust_bundle
 
 
 def compile_kernels() -> None:
@@ -26,7 +24,3 @@ def compile_kernels() -> None:
     clustered_covariances(make_scene(0, 3, 40).observed, fixed)
     camera, tracks = model.cameras[0], model.tracks
     refine_pose(camera.canonical, model.cam_from_world[0], model.point_xyz, tracks.obs_xy[:8])
-    engine = make_engine(model, fixed)
-    problem = engine.problem
-    mark_pairs(problem.points, problem.images(engine.rows), problem.lenses, np.eye(problem.num_blocks, dtype=bool))
-    find_slot(*number_keys(np.arange(3)), 0)

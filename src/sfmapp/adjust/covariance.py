@@ -170,18 +170,12 @@ def reduced_matrix(engine: Engine, is_kept: Mask | None = None) -> Array:
 def upper_tiles(engine: Engine) -> tuple[Ints, Ints, Array]:
     """Blocks a <= b (M,) that meet in the undamped reduced system, and their tiles (M, 8, 8), of which upper halves
     count where a block meets itself."""
-    tiles = engine.tiles[0]
+    tiles = engine.tiles
     if engine.extras is not None:
         engine.extras.add_pairs(tiles, engine.tile_numbers(engine.extras.pairs))
-    if len(engine.hash_keys) == 0:
-        keys = np.arange(engine.problem.num_blocks**2)
-        numbers = keys
-    else:
-        held = engine.hash_keys >= 0
-        keys, numbers = engine.hash_keys[held], engine.hash_values[held]
-    a, b = np.divmod(keys, engine.problem.num_blocks)
+    a, b = np.divmod(engine.tile_keys, engine.problem.num_blocks)
     upper = a <= b
-    return a[upper], b[upper], tiles.reshape(-1, 8, 8)[numbers[upper]]
+    return a[upper], b[upper], tiles.reshape(-1, 8, 8)[upper]
 
 
 def _through_others(tiles: tuple[Ints, Ints, Array], is_kept: Mask) -> Array:

@@ -6,7 +6,7 @@ one tangent (rotation, translation) is the negative of the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -296,7 +296,7 @@ class SparseSystem:
         self._ordering: Any = None
         self._is_weak = False
 
-    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+    def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
         """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
         diagonal = tiles.reshape(-1, 8, 8)[self._diagonal][:, np.arange(8), np.arange(8)]
         if not (diagonal > 0.0).all():

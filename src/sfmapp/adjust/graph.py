@@ -1,8 +1,8 @@
 """A reconstruction as a gtsam factor graph in which the landmarks are eliminated by our kernels.
 
 What is left is over poses ``X(i)`` and intrinsics ``K(c)``, beside which any other gtsam factor stands with its noise
-model and robust kernel. The graph is driven by our Levenberg-Marquardt steps, its linear systems are solved by gtsam,
-or by LAPACK where most blocks meet most others.
+model and robust kernel. The graph is driven by our Levenberg-Marquardt steps; its linear systems are solved by gtsam
+where they are sparse, by LAPACK where most blocks meet most others, and by the envelope where they are large.
 """
 
 from __future__ import annotations

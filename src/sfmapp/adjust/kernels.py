@@ -10,8 +10,10 @@ loses Z_a Z_b^T per pair of blocks. Those that other factors mention are blocks 
 A pose may be that of a rig which several images share: each has its own row of what the rig's pose and the constant
 mounting of its camera make together, and the derivatives are taken to the rig's frame.
 
-Nothing is kept per observation. Points come in chunks whose number depends on the problem alone; each chunk has its own
-sums, which are added in order, so the result does not depend on the number of threads.
+Points come in batches whose Z have room, and a batch in chunks whose number depends on the problem alone; each chunk
+has its own sums over blocks, which are added in order. The products Z_a Z_b^T are then taken row by row of tiles, each
+row by one thread, over its points in order (:mod:`sfmapp.adjust.elimination`). So the result does not depend on the
+number of threads, and no thread needs tiles of its own.
 """
 
 from __future__ import annotations
@@ -115,30 +117,16 @@ class LensArrays(NamedTuple):
     free_column: Ints
 
 
-class BlockArrays(NamedTuple):
-    """Blocks of unknowns (B).
-
-    Attributes:
-        dim: (B,) int64 rows in use of each.
-        hash_keys, hash_values: tile of block pair a <= b under key a B + b; empty if that number is the tile's as well.
-    """
-
-    dim: Ints
-    hash_keys: Ints
-    hash_values: Ints
-
-
 class Sums(NamedTuple):
-    """What the points of a chunk add up to.
+    """What the points of a chunk add up to, beside what eliminating them takes off the tiles.
 
     Attributes:
-        tiles: (N * 64,) sum of -Z_a Z_b^T. own: (B * 64,) J^T J of each block with itself, not eliminated.
+        own: (B * 64,) J^T J of each block with itself, not eliminated.
         cross: (I * 64,) J_pose^T J_intrinsics of images whose camera has a block of its own. Where a camera has a
             second one ((2 I + C) * 64,): behind it the same of that, and J_first^T J_second of each camera.
         gradient: (2 * B * 8,) J^T r before elimination, and what elimination adds to it.
     """
 
-    tiles: Array
     own: Array
     cross: Array
     gradient: Array
@@ -150,6 +138,20 @@ class State(NamedTuple):
     rows: Array
     canonical: Array
     xyz: Array
+
+
+class Meetings(NamedTuple):
+    """Which blocks (B) meet in each point: entries (E), those of point p at ``ptr[p] : ptr[p + 1]``, ascending.
+
+    Attributes:
+        dim: (B,) int64 rows in use of each block. ptr: (P + 1,) int64. block: (E,) int32.
+        partners: (E, 2) int32 first and last of the entries of the same point with which this one makes a product.
+    """
+
+    dim: Ints
+    ptr: Ints
+    block: Int32s
+    partners: Int32s
 
 
 class Scratch(NamedTuple):
@@ -327,39 +329,18 @@ def squared_residual(
     return s2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def find_slot(keys: Ints, values: Ints, key: int) -> int:
-    """Value of a key in an open hash table of power-of-two size with -1 for empty; -1 where absent."""
-    mask = keys.shape[0] - 1
-    h = ((key * 0x9E3779B97F4A7C) >> 20) & mask
-    while keys[h] != key:
-        if keys[h] < 0:
-            return -1
-        h = (h + 1) & mask
-    return values[h]
+def scratch_size(num_blocks: int, num_free: int) -> tuple[int, int]:
+    """(doubles, integers) of scratch."""
+    return _FIXED + 8 * num_free, num_blocks
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def scratch_size(first: int, last: int, point_ptr: Ints, num_blocks: int, num_free: int) -> tuple[int, int]:
-    """(doubles, integers) of scratch for points first..last."""
-    longest = 1
-    for p in range(first, last):
-        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    places = min(3 * longest, num_blocks) + 1
-    return _FIXED + 8 * num_free + 24 * places, 2 * num_blocks + places
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _place(W: Pointer, where: Pointer, mark: Pointer, blocks: Pointer, p: int, block: int, count: int) -> int:
-    """Give a block its three rows among those of point p, zeroed at first sight; returns how many there are."""
-    if mark[block] != p + 1:
-        mark[block] = p + 1
-        where[block] = count
-        blocks[count] = block
+def _begin_point(Z: Pointer, where: Pointer, blocks: Int32s, first: int, last: int) -> None:
+    """Zero the three rows of each block first..last that meets a point, and tell where they are among them."""
+    for n in range(last - first):
+        where[blocks[first + n]] = n
         for row in range(3):
-            store8(W, count * 24 + 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        return count + 1
-    return count
+            store8(Z, n * 24 + 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -409,57 +390,53 @@ def _factor_point(normal: Pointer, damping: float, factor: Pointer, small: Point
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _keep_point(
-    block: int, num_blocks: int, normal: Pointer, W: Pointer, met: Pointer, count: int, sums: Sums, blocks: BlockArrays
-) -> None:
-    """Add a point that is a block of its own: its normal equations, and W (count, 3, 8) of the blocks that it met."""
-    tile, own, gradient = pointer(sums.tiles), sums.own, sums.gradient
+def _keep_point(block: int, normal: Pointer, Z: Pointer, count: int, sums: Sums) -> None:
+    """Add the normal equations of a point that is a block of its own, the last of the count that meet in it.
+
+    Its rows become minus the unit matrix: what ``Z_a Z_b^T`` takes off a tile is then what W adds to it.
+    """
     for j in range(3):
-        gradient[block * 8 + j] += normal[8 * j + 3]
+        sums.gradient[block * 8 + j] += normal[8 * j + 3]
+        Z[(count - 1) * 24 + 9 * j] = -1.0
         for k in range(3):
-            own[block * 64 + 8 * j + k] += normal[8 * min(j, k) + max(j, k)]
-    for n in range(count):
-        key = met[n] * num_blocks + block
-        if blocks.hash_keys.shape[0] > 0:
-            key = find_slot(blocks.hash_keys, blocks.hash_values, key)
-        for j in range(8):
-            for k in range(3):
-                tile[key * 64 + 8 * j + k] += W[n * 24 + 8 * k + j]
+            sums.own[block * 64 + 8 * j + k] += normal[8 * min(j, k) + max(j, k)]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_points(
-    part: tuple[int, int], points: PointArrays, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays,
-    loss: RobustLoss, damping: float, sums: Sums, point_factor: Array, scratch: Scratch,
+    part: tuple[int, int], points: PointArrays, images: ImageArrays, lenses: LensArrays, meetings: Meetings,
+    loss: RobustLoss, damping: float, sums: Sums, point_factor: Array, rows: Array, scratch: Scratch,
 ) -> float:  # fmt: skip
     """Linearise points ``part[0]`` to ``part[1]`` and eliminate them; returns the cost of their observations.
 
+    What that takes off the tiles is left to :func:`sfmapp.adjust.elimination.subtract_products`.
+
     Args:
-        sums: filled.
+        sums: added to.
         point_factor: (P, 12) out: L^-1 (l00 l10 l11 l20 l21 l22), gradient, damped diagonal increment; all zero for a
             point that has no depth at all, or is a block.
+        rows: out: 3 x 8 of ``Z = W L^-T`` for each block that meets each of the points.
     """
     point_ptr, obs_image, obs_xy, xyz, is_constant, point_block = points
     poses, image_mount, mounts, image_camera, image_block = images
     intrinsics, penalty, camera_block, _, free_ptr, free_slot, free_column = lenses
-    block_dim, hash_keys, hash_values = blocks
-    tiles, own, cross, gradient = sums
+    block_dim, ptr, met = meetings.dim, meetings.ptr, meetings.block
+    own, cross, gradient = sums
     doubles, integers = scratch
     num_blocks = block_dim.shape[0]
-    tiles[:], own[:], cross[:], gradient[:], doubles[:], integers[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    doubles[:] = 0.0
     pose, lens, J = pointer(poses), pointer(intrinsics), pointer(doubles)
-    mount = pointer(mounts)
-    tile, mark = pointer(tiles), pointer(integers)
-    where, met = offset(mark, num_blocks), offset(mark, 2 * num_blocks)
+    mount, where = pointer(mounts), pointer(integers)
     normal, small, zeros, units = offset(J, _NORMAL), offset(J, _SMALL), offset(J, _ZEROS), offset(J, _FIXED)
-    W = offset(units, 8 * free_slot.shape[0])
     for n in range(free_slot.shape[0]):
         units[n * 8 + free_column[n] % 8] = 1.0
     cost, product = 0.0, 1.0
     for p in range(part[0], part[1]):
         x0, x1, x2 = xyz[p, 0], xyz[p, 1], xyz[p, 2]
         moves = not is_constant[p]
-        count = 0
+        count = ptr[p + 1] - ptr[p]
+        Z = offset(pointer(rows), 24 * (ptr[p] - ptr[part[0]]))
+        _begin_point(Z, where, met, ptr[p], ptr[p + 1])
         for row in range(3):
             store8(normal, 8 * row, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         for o in range(point_ptr[p], point_ptr[p + 1]):
@@ -479,8 +456,7 @@ def reduce_points(
                 add2(own, block * 64, J, POSE, J, POSE, block_dim[block])
                 add2(gradient, block * 8, J, POINT + 3, J, POSE, 1)
                 if moves:
-                    count = _place(W, where, mark, met, p, block, count)
-                    add2(W, where[block] * 24, J, POINT, J, POSE, 3)
+                    add2(Z, where[block] * 24, J, POINT, J, POSE, 3)
             if other >= 0 and other != block:
                 split = _split(free_column, free_ptr[c], free_ptr[c + 1])
                 spread(J, INTR, zeros, J, CANON, free_slot, units, free_ptr[c], split)
@@ -489,8 +465,7 @@ def reduce_points(
                 if block >= 0:
                     add2(cross, i * 64, J, POSE, J, INTR, 6)
                 if moves:
-                    count = _place(W, where, mark, met, p, other, count)
-                    add2(W, where[other] * 24, J, POINT, J, INTR, 3)
+                    add2(Z, where[other] * 24, J, POINT, J, INTR, 3)
                 if split < free_ptr[c + 1]:
                     second, num_images = other + 1, image_block.shape[0]
                     spread(J, _SECOND, zeros, J, CANON, free_slot, units, split, free_ptr[c + 1])
@@ -500,25 +475,19 @@ def reduce_points(
                     if block >= 0:
                         add2(cross, (num_images + i) * 64, J, POSE, J, _SECOND, 6)
                     if moves:
-                        count = _place(W, where, mark, met, p, second, count)
-                        add2(W, where[second] * 24, J, POINT, J, _SECOND, 3)
+                        add2(Z, where[second] * 24, J, POINT, J, _SECOND, 3)
         if point_block[p] >= 0:
-            _keep_point(point_block[p], num_blocks, normal, W, met, count, sums, blocks)
+            _keep_point(point_block[p], normal, Z, count, sums)
             continue
-        if not moves or not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
+        if not moves:
+            continue
+        if not _factor_point(normal, damping, offset(pointer(point_factor), 12 * p), small):
+            _begin_point(Z, where, met, ptr[p], ptr[p + 1])
             continue
         for n in range(count):
             # Z = W L^-T in place
-            assign3(W, n * 24, small, 0, W, n * 24, 3)
-            subtract3(gradient, (num_blocks + met[n]) * 8, small, 3, W, n * 24, 1)
-        for n in range(count):
-            for m in range(n, count):
-                # tiles are kept for a <= b only
-                low, high = (n, m) if met[n] <= met[m] else (m, n)
-                key = met[low] * num_blocks + met[high]
-                if hash_keys.shape[0] > 0:
-                    key = find_slot(hash_keys, hash_values, key)
-                subtract3(tile, key * 64, W, low * 24, W, high * 24, block_dim[met[low]])
+            assign3(Z, n * 24, small, 0, Z, n * 24, 3)
+            subtract3(gradient, (num_blocks + met[ptr[p] + n]) * 8, small, 3, Z, n * 24, 1)
     return total_loss(loss, cost, product)
 
 

@@ -3,50 +3,54 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.kernels import BlockArrays, ImageArrays, LensArrays, PointArrays, Sums, find_slot
+from sfmapp.adjust.elimination import TileRows, find_tile
+from sfmapp.adjust.kernels import ImageArrays, LensArrays, Sums
 from sfmapp.packages import BLAS_THREADS
 from sfmapp.simd.f64x8 import assign8, subtract8
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SolverName = Literal["tiles", "gtsam", "lapack"]
+SolverName = Literal["tiles", "gtsam", "lapack", "envelope"]
 
 # Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. Up to 400 unknowns, some
 # 65 poses, LAPACK is as quick as gtsam at any fill, for so few poses fill much of their system when they are eliminated
 # whatever it held before. Beyond that gtsam is as quick up to about a quarter, and falls behind by up to six times.
-_SMALL, _GTSAM_FILL = 400, 0.25
-# The quick rounds keep the tiles up to the size at which nothing beats them by much, and beyond that in the range of
-# fill in which they are quickest.
-_FEW_BLOCKS, _TILES_FILL = 160, (0.3, 0.5)
+_SMALL, _SPARSE_FILL = 400, 0.25
+# Up to so many blocks nothing beats the tiles of the quick rounds by much; beyond that the envelope is quickest at any
+# fill, by up to five times.
+_FEW_BLOCKS = 160
 # Poses that gtsam eliminates together.
 _GROUP = 6
 # What rounding leaves of a zero pivot, against the diagonal before.
 _NO_PIVOT = 1e-14
 
 
-def is_beyond_lapack(num_unknowns: int) -> bool:
-    """Whether gtsam may solve a closing system of that size."""
-    return num_unknowns > _SMALL
+def may_suit_gtsam(num_blocks: int, num_unknowns: int) -> bool:
+    """Whether gtsam solves a closing system of that size best, if it is sparse."""
+    return num_unknowns > _SMALL and num_blocks <= _FEW_BLOCKS
+
+
+def is_sparse(fill: float) -> bool:
+    """Whether a factor has few enough entries for sparse algebra to be quicker."""
+    return fill <= _SPARSE_FILL
 
 
 def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing: bool) -> SolverName:
     """What solves a reduced system best."""
+    if num_blocks > _FEW_BLOCKS:
+        return "envelope"
     if is_closing:
-        return "gtsam" if is_beyond_lapack(num_unknowns) and fill <= _GTSAM_FILL else "lapack"
-    if num_blocks <= _FEW_BLOCKS:
-        return "tiles"
-    if fill <= _TILES_FILL[0]:
-        return "gtsam"
-    return "tiles" if fill <= _TILES_FILL[1] else "lapack"
+        return "gtsam" if may_suit_gtsam(num_blocks, num_unknowns) and is_sparse(fill) else "lapack"
+    return "tiles"
 
 
 def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:
@@ -75,57 +79,51 @@ def aligned_zeros(*shape: int) -> Array:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def assemble(
-    sums: Sums, images: ImageArrays, lenses: LensArrays, blocks: BlockArrays, extra_own: Array, extra_gradient: Array,
-    diagonal: Array,
+    tiles: Array, sums: Sums, images: ImageArrays, lenses: LensArrays, block_dim: Ints, tile_rows: TileRows,
+    extra: tuple[Array, Array], diagonal: Array,
 ) -> None:  # fmt: skip
-    """Add up the sums of all chunks (K, ...), in order, in the first.
+    """Add up the sums of all chunks (K, ...), in order, in the first, and put ``own`` and ``cross`` into the tiles.
 
-    Adds extra_own (B * 64,) and extra_gradient (B * 8,), what priors say about single blocks; fills diagonal (B * 8,)
-    with the diagonal before elimination, on which the damping is based, and puts ``own`` and ``cross`` into the tiles.
+    Adds extra, (B * 64,) and (B * 8,), what priors say about single blocks and their gradient; fills diagonal (B * 8,)
+    with the diagonal before elimination, on which the damping is based.
     """
-    tiles, own, cross, gradient = sums
-    block_dim, hash_keys, hash_values = blocks
+    own, cross, gradient = sums
     image_block, image_camera = images.block, images.camera
     camera_block, second_block = lenses.block, lenses.second
     num_blocks = block_dim.shape[0]
-    for k in range(1, tiles.shape[0]):
-        tiles[0] += tiles[k]
+    for k in range(1, own.shape[0]):
         own[0] += own[k]
         cross[0] += cross[k]
         gradient[0] += gradient[k]
-    own[0] += extra_own
-    gradient[0, : num_blocks * 8] += extra_gradient
+    own[0] += extra[0]
+    gradient[0, : num_blocks * 8] += extra[1]
     for a in range(num_blocks):
-        tile = a * num_blocks + a
-        if hash_keys.shape[0] > 0:
-            tile = find_slot(hash_keys, hash_values, tile)
+        tile = find_tile(tile_rows, a, a)
         for n in range(64):
-            tiles[0, tile * 64 + n] += own[0, a * 64 + n]
+            tiles[tile * 64 + n] += own[0, a * 64 + n]
         for x in range(8):
             d = own[0, a * 64 + 9 * x]
             diagonal[a * 8 + x] = d if d > 0.0 and x < block_dim[a] else 1.0
             if x >= block_dim[a]:
-                tiles[0, tile * 64 + 9 * x] = 1.0
+                tiles[tile * 64 + 9 * x] = 1.0
     num_images = image_block.shape[0]
     for i in range(num_images):
         a, b, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
         if a >= 0 and b >= 0 and a != b:
-            _add_tile(sums, i, a * num_blocks + b, blocks)
+            _add_tile(tiles, cross, i, find_tile(tile_rows, a, b))
             if second >= 0:
-                _add_tile(sums, num_images + i, a * num_blocks + second, blocks)
+                _add_tile(tiles, cross, num_images + i, find_tile(tile_rows, a, second))
     for c in range(camera_block.shape[0]):
         if second_block[c] >= 0:
-            _add_tile(sums, 2 * num_images + c, camera_block[c] * num_blocks + second_block[c], blocks)
+            _add_tile(tiles, cross, 2 * num_images + c, find_tile(tile_rows, camera_block[c], second_block[c]))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_tile(sums: Sums, source: int, tile: int, blocks: BlockArrays) -> None:
-    """Add a tile of ``cross`` to that of a pair of blocks, a B + b, if there is one."""
-    if blocks.hash_keys.shape[0] > 0:
-        tile = find_slot(blocks.hash_keys, blocks.hash_values, tile)
+def _add_tile(tiles: Array, cross: Array, source: int, tile: int) -> None:
+    """Add a tile of ``cross`` to that of a pair of blocks, if there is one."""
     if tile >= 0:
         for n in range(64):
-            sums.tiles[0, tile * 64 + n] += sums.cross[0, source * 64 + n]
+            tiles[tile * 64 + n] += cross[0, source * 64 + n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -224,55 +222,6 @@ def solve_tiles(tiles: Array, num_blocks: int, inverse: Array, x: Array) -> None
             x[8 * k + a] = y[a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(points: PointArrays, images: ImageArrays, lenses: LensArrays, pairs: NDArray[np.bool_]) -> None:
-    """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
-    point_ptr, obs_image = points.ptr, points.image
-    image_camera, image_block, camera_block, second_block = images.camera, images.block, lenses.block, lenses.second
-    longest = 1
-    for p in range(point_ptr.shape[0] - 1):
-        longest = max(longest, point_ptr[p + 1] - point_ptr[p])
-    blocks = np.zeros(3 * longest, np.int64)
-    for p in range(point_ptr.shape[0] - 1):
-        found = 0
-        for o in range(point_ptr[p], point_ptr[p + 1]):
-            i = obs_image[o]
-            block, other, second = image_block[i], camera_block[image_camera[i]], second_block[image_camera[i]]
-            if block >= 0:
-                blocks[found] = block
-                found += 1
-            # neighbours in a track often share the camera
-            if other >= 0 and other != block and (found == 0 or blocks[found - 1] not in (other, second)):
-                blocks[found] = other
-                found += 1
-                if second >= 0:
-                    blocks[found] = second
-                    found += 1
-        if points.block[p] >= 0:
-            pairs[points.block[p], points.block[p]] = True
-            for n in range(found):
-                pairs[blocks[n], points.block[p]] = True
-        for n in range(found):
-            for m in range(n, found):
-                pairs[min(blocks[n], blocks[m]), max(blocks[n], blocks[m])] = True
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def number_keys(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """An open hash table, half full at most, that gives each of the different keys (N,) its position."""
-    size = 16
-    while size < 2 * keys.shape[0] + 1:
-        size *= 2
-    table, values = np.full(size, -1, np.int64), np.zeros(size, np.int64)
-    for n in range(keys.shape[0]):
-        h = ((keys[n] * 0x9E3779B97F4A7C) >> 20) & (size - 1)
-        while table[h] >= 0:
-            h = (h + 1) & (size - 1)
-        table[h] = keys[n]
-        values[h] = n
-    return table, values
-
-
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Hold the linear algebra of numpy and scipy to one thread: our workers use the cores, and the order of sums, to
@@ -292,8 +241,11 @@ def one_blas_thread() -> Iterator[None]:
 class ReducedSystem(Protocol):
     """What solves the reduced system."""
 
-    def solve(self, tiles: Array, rhs: Array) -> Array | None:
-        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
+    def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
+        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite.
+
+        ``run`` maps tasks on threads; the result does not depend on how many they are.
+        """
 
 
 class TileSystem:
@@ -302,7 +254,7 @@ class TileSystem:
     def __init__(self, num_blocks: int) -> None:
         self._num_blocks, self._inverse = num_blocks, aligned_zeros(num_blocks * 64)
 
-    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+    def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
         """Solution (B * 8,), None where the system is not positive definite. Tiles and right-hand side are spoilt."""
         if not factorize_tiles(tiles, self._num_blocks, self._inverse):
             return None
@@ -324,7 +276,7 @@ class LapackSystem:
         size = int(block_dim.sum())
         self._matrix = np.zeros((size, size))
 
-    def solve(self, tiles: Array, rhs: Array) -> Array | None:
+    def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
         _gather_lower(tiles, self._pairs, self._first, self._dim, self._matrix)
         try:
             factor: Array = np.linalg.cholesky(self._matrix).astype(np.float64, copy=False)

@@ -27,6 +27,7 @@ from sfmapp.adjust.covariance import (
     residual_variance,
     upper_tiles,
 )
+from sfmapp.adjust.linear import is_sparse
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
@@ -91,7 +92,7 @@ def covariance_of_functions(engine: Engine, rows: Array) -> Array | None:
     """
     used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
     wanted, none = rows[:, used], np.zeros((0, int(used.sum())))
-    if engine.solver == "gtsam":
+    if engine.solver == "gtsam" or (engine.solver == "envelope" and is_sparse(engine.fill)):
         engine.linearize(0.0, map)
         matrix = _sparse_system(engine, used)
         root = 1.0 / np.sqrt(matrix.diagonal())

@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust import kernels
-from sfmapp.adjust.kernels import BlockArrays, RobustLoss, Scratch, State, Sums, find_slot
+from sfmapp.adjust.elimination import (
+    GROUP,
+    Runs,
+    TileRows,
+    find_meetings,
+    find_runs,
+    mark_pairs,
+    subtract_products,
+)
+from sfmapp.adjust.kernels import Meetings, RobustLoss, Scratch, State, Sums
 from sfmapp.adjust.linear import (
     LapackSystem,
     ReducedSystem,
@@ -25,35 +34,36 @@ from sfmapp.adjust.linear import (
     aligned_zeros,
     assemble,
     choose_solver,
-    is_beyond_lapack,
-    mark_pairs,
-    number_keys,
+    may_suit_gtsam,
     one_blas_thread,
 )
 from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
 from sfmapp.adjust.problem import EVERYTHING, NOTHING, Problem, Varying, make_problem, write_back
+from sfmapp.adjust.progress import StepProgress
 from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
-# Beyond so many blocks only the tiles of pairs that meet are kept, if they are at most this share of all.
-_MAX_DENSE_BLOCKS, _DENSE_SHARE = 160, 0.3
+# Beyond so many blocks only the tiles of pairs that meet are kept.
+_MAX_DENSE_BLOCKS = 160
 # Beside a shape that has settled, single points may still lower the cost by this share of it.
 _POINTS_SETTLED = 1e-3
-# Work worth a chunk of its own, and the most memory that the chunks' private sums may take together.
-_CHUNK_OBSERVATIONS, _MAX_CHUNKS, _CHUNK_BYTES = 16384, 8, 1 << 26
+# Work worth a chunk of its own, and the most chunks.
+_CHUNK_OBSERVATIONS, _MAX_CHUNKS = 16384, 8
+# Entries of a batch of points, of 192 bytes each, and products of blocks worth a thread.
+_BATCH_ENTRIES, _PART_PRODUCTS, _MAX_PARTS = 700_000, 1_000_000, 64
 
 
 def import_ahead(num_images: int, *, with_factors: bool) -> None:
     """Begin to import gtsam in a thread, which takes 0.7 s and 57 MB, if closing adjustments may ask it.
 
-    They do where they have factors beside the reprojections, or more unknowns than LAPACK solves best at any fill.
+    They do where they have factors beside the reprojections, or a size at which gtsam solves sparse systems best.
     """
-    if (with_factors or is_beyond_lapack(6 * num_images)) and "gtsam" not in sys.modules:
+    if (with_factors or may_suit_gtsam(num_images, 6 * num_images)) and "gtsam" not in sys.modules:
         Thread(target=import_module, args=("gtsam",), name="import-gtsam").start()
 
 
@@ -85,7 +95,7 @@ def adjust_bundle(
             images or points only add to the cost; those on constant cameras, unregistered images and points without a
             place are left out.
         threads: at most this many; the result does not depend on it.
-        events: asked for cancellation at every step.
+        events: told of every step of long adjustments, and asked for cancellation.
 
     Raises:
         InterruptedRunError: on cancellation; the reconstruction then holds the best state so far.
@@ -111,7 +121,7 @@ def run_engine(
     """Adjust, and put the state into the reconstruction."""
     start = time.perf_counter()
     problem = engine.problem
-    workers = min(threads, engine.num_chunks)
+    workers = min(threads, engine.num_tasks)
     with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool, engine.lone():
         try:
             outcome = _minimize(engine, options, pool.map if pool is not None else map, events)
@@ -181,83 +191,124 @@ class Engine:
         if extras is not None:
             extras.weight = noise_px**2
         blocks, images = p.num_blocks, len(p.image_idx)
-        empty = np.zeros(0, np.int64)
-        self.hash_keys, self.hash_values, self.num_tiles = empty, empty, blocks * blocks
         self.solver: SolverName = "tiles"
         self.fill = 1.0
         self.system: ReducedSystem | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
-        if blocks and (is_closing or blocks > _MAX_DENSE_BLOCKS):
-            self._choose_system(is_closing)
-        fitting = max(1, _CHUNK_BYTES // max(1, self.num_tiles * 512))
-        self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, min(_MAX_CHUNKS, fitting)))
-        shares = np.linspace(0, p.num_observations, self.num_chunks + 1)
-        self.limits = np.searchsorted(p.point_ptr, shares)
-        self.limits[0], self.limits[-1] = 0, len(p.track_idx)
+        self._arrange_points()
+        self._arrange_tiles(is_closing)
         chunks = self.num_chunks
         num_cross = images if (p.second_block < 0).all() else 2 * images + len(p.camera_idx)
-        self.tiles = aligned_zeros(chunks, self.num_tiles * 64)
+        self.tiles = aligned_zeros(len(self.tile_rows.column) * 64)
         self.own, self.cross = aligned_zeros(chunks, blocks * 64), aligned_zeros(chunks, num_cross * 64)
         self.gradient = aligned_zeros(chunks, 2 * blocks * 8)
         self.diagonal = np.ones(blocks * 8)
         self.factor = np.zeros((len(p.track_idx), 12))
         self.sums = np.zeros((chunks, 2))
-        sizes = [
-            kernels.scratch_size(self.limits[k], self.limits[k + 1], p.point_ptr, blocks, len(p.free.slot))
-            for k in range(chunks)
-        ]
-        self.scratch = [Scratch(aligned_zeros(doubles), np.zeros(integers, np.int64)) for doubles, integers in sizes]
+        doubles, integers = kernels.scratch_size(blocks, len(p.free.slot))
+        self.scratch = [Scratch(aligned_zeros(doubles), np.zeros(integers, np.int64)) for _ in range(chunks)]
         self.new_poses, self.new_rows = np.empty_like(p.poses), np.empty_like(self.rows)
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = self.shape_decrease = 0.0
 
-    def _choose_system(self, is_closing: bool) -> None:
-        """See which blocks meet, keep only their tiles unless that is most of them, and choose what solves."""
+    def _arrange_points(self) -> None:
+        """See which blocks meet in each point, and part points in batches of chunks."""
+        p = self.problem
+        found = find_meetings(p.points, p.images(self.rows), p.lenses, p.num_blocks)
+        self.meetings = Meetings(p.block_dim, *found)
+        ptr, num_points = self.meetings.ptr, len(p.track_idx)
+        num_batches = max(1, -(-int(ptr[-1]) // _BATCH_ENTRIES))
+        batches = np.searchsorted(ptr, np.linspace(0, int(ptr[-1]), num_batches + 1))
+        batches[0], batches[-1] = 0, num_points
+        self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, _MAX_CHUNKS))
+        ends = p.point_ptr[batches]
+        self.limits = np.searchsorted(p.point_ptr, np.linspace(ends[:-1], ends[1:], self.num_chunks + 1, axis=1))
+        self.limits[:, 0], self.limits[:, -1] = batches[:-1], batches[1:]
+        self.shares = np.searchsorted(p.point_ptr, np.linspace(0, p.num_observations, self.num_chunks + 1))
+        self.shares[0], self.shares[-1] = 0, num_points
+        self.runs = Runs(*find_runs(self.meetings, batches))
+        self.point_rows = aligned_zeros(int(np.diff(ptr[batches]).max(initial=0)) * 24)
+
+    def _arrange_tiles(self, is_closing: bool) -> None:
+        """Choose what solves, the tiles that are kept, and parts of their rows that cost alike."""
         p, blocks = self.problem, self.problem.num_blocks
-        met = np.eye(blocks, dtype=bool)
-        mark_pairs(p.points, p.images(self.rows), p.lenses, met)
+        met, products = np.eye(blocks, dtype=bool), np.zeros(-(-blocks // GROUP), np.int64)
+        mark_pairs(self.meetings, self.runs, met, products)
+        other, second = p.camera_block[p.image_camera], p.second_block
+        shared = (p.image_block >= 0) & (other >= 0)
+        met[p.image_block[shared], other[shared]] = True
+        shared &= second[p.image_camera] >= 0
+        met[p.image_block[shared], second[p.image_camera[shared]]] = True
+        met[p.camera_block[second >= 0], second[second >= 0]] = True
         if self.extras is not None:
             met.reshape(-1)[self.extras.pairs] = True
-        keys = np.flatnonzero(met)
-        self.fill = 2 * len(keys) / max(1, blocks * (blocks + 1))
-        self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
-        numbers = keys
-        if self.solver != "tiles" and blocks > _MAX_DENSE_BLOCKS and self.fill <= _DENSE_SHARE:
-            self.num_tiles, numbers = len(keys), np.arange(len(keys))
-            self.hash_keys, self.hash_values = number_keys(keys)
+        is_small = blocks <= _MAX_DENSE_BLOCKS
+        keys = numbers = np.flatnonzero(met)
+        if blocks and (is_closing or not is_small):
+            self.fill = 2 * len(keys) / (blocks * (blocks + 1))
+            self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
+        if is_small or self.solver == "tiles":
+            self.tile_keys = np.arange(blocks * blocks)
+        else:
+            self.tile_keys, numbers = keys, np.arange(len(keys))
+        row, column = np.divmod(self.tile_keys, max(1, blocks))
+        self.tile_rows = TileRows(np.searchsorted(row, np.arange(blocks + 1)), column)
+        num_parts = int(np.clip(products.sum() // _PART_PRODUCTS, 1, _MAX_PARTS))
+        self.parts = np.searchsorted(np.cumsum(products), np.linspace(0, products.sum(), num_parts + 1))
+        self.parts[0], self.parts[-1] = 0, len(products)
         if self.solver == "gtsam":
             from sfmapp.adjust.factors import SparseSystem
 
             self.system = SparseSystem(p, keys, numbers, self.extras.block_keys() if self.extras else [])
         elif self.solver == "lapack":
             self.system = LapackSystem(p.block_dim, keys, numbers)
+        elif self.solver == "envelope":
+            from sfmapp.adjust.envelope import EnvelopeSystem  # loads scipy
+
+            self.system = EnvelopeSystem(p.block_dim, keys, numbers)
+
+    @property
+    def num_tasks(self) -> int:
+        """So many threads have something to do."""
+        return max(self.num_chunks, len(self.parts) - 1)
 
     def lone(self) -> AbstractContextManager[Any]:
         """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
-        return one_blas_thread() if self.solver == "lapack" else nullcontext()
+        return one_blas_thread() if self.solver in ("lapack", "envelope") else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
         p, self.damping = self.problem, damping
         points, images, lenses = p.points, p.images(self.rows), p.lenses
-        blocks = BlockArrays(p.block_dim, self.hash_keys, self.hash_values)
+        self.own[:], self.cross[:], self.gradient[:] = 0.0, 0.0, 0.0
+        cost = 0.0
+        for batch, limits in enumerate(self.limits):
+            first = self.meetings.ptr[limits]
 
-        def chunk(k: int) -> float:
-            sums = Sums(self.tiles[k], self.own[k], self.cross[k], self.gradient[k])
-            cost: float = kernels.reduce_points(
-                (self.limits[k], self.limits[k + 1]), points, images, lenses, blocks, self.loss, damping, sums,
-                self.factor, self.scratch[k],
-            )  # fmt: skip
-            return cost
+            def chunk(k: int, limits: Ints = limits, first: Ints = first) -> float:
+                sums = Sums(self.own[k], self.cross[k], self.gradient[k])
+                rows = self.point_rows[24 * (first[k] - first[0]) :]
+                part: float = kernels.reduce_points(
+                    (limits[k], limits[k + 1]), points, images, lenses, self.meetings, self.loss, damping, sums,
+                    self.factor, rows, self.scratch[k],
+                )  # fmt: skip
+                return part
 
-        cost = sum(run(chunk, range(self.num_chunks)))
+            def products(k: int, batch: int = batch, first: Ints = first) -> None:
+                subtract_products(
+                    (self.parts[k], self.parts[k + 1]), batch, self.meetings, self.runs, self.point_rows,
+                    first[0], self.tile_rows, self.tiles,
+                )  # fmt: skip
+
+            cost += sum(run(chunk, range(self.num_chunks)))
+            list(run(products, range(len(self.parts) - 1)))
         own, gradient = np.zeros(p.num_blocks * 64), np.zeros(p.num_blocks * 8)
         self.priors.add(p.canonical, own, gradient)
         if self.extras is not None:
             self.extras.linearize(own, gradient)
-        every = Sums(self.tiles, self.own, self.cross, self.gradient)
-        assemble(every, images, lenses, blocks, own, gradient, self.diagonal)
+        sums = Sums(self.own, self.cross, self.gradient)
+        assemble(self.tiles, sums, images, lenses, p.block_dim, self.tile_rows, (own, gradient), self.diagonal)
         total: float = cost + self.other_cost()
         return total
 
@@ -271,12 +322,12 @@ class Engine:
         cost = self.priors.cost(p.canonical)
         return cost + extras.cost(p.poses, p.canonical, p.xyz, extras.values) if extras is not None else cost
 
-    def solve(self) -> Array | None:
+    def solve(self, run: Callable[..., Any] = map) -> Array | None:
         """Step of the blocks (B * 8,), or None where the damped system is not positive definite.
 
         ``shape_decrease`` is then what the blocks have to gain, were all points at their best already.
         """
-        p, blocks, tiles = self.problem, self.problem.num_blocks, self.tiles[0]
+        p, blocks, tiles = self.problem, self.problem.num_blocks, self.tiles
         right = -self.gradient[0].reshape(2, -1).sum(0)
         if self.extras is not None:
             self.extras.add_pairs(tiles, self.tile_numbers(self.extras.pairs))
@@ -285,7 +336,7 @@ class Engine:
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
         if self.system is None:
             self.system = TileSystem(blocks)
-        found = self.system.solve(tiles, right.copy())
+        found = self.system.solve(tiles, right.copy(), run)
         if found is None or not np.isfinite(found).all():
             return None
         self.shape_decrease = 0.5 * float(right @ found)
@@ -315,11 +366,9 @@ class Engine:
             num_unknowns -= self.extras.num_own_dims
         return 2 * p.num_observations - 3 * num_eliminated - num_unknowns + free_gauge
 
-    def tile_numbers(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    def tile_numbers(self, keys: Ints) -> Ints:
         """Tiles of block pairs a B + b."""
-        if len(self.hash_keys) == 0:
-            return keys
-        return np.array([find_slot(self.hash_keys, self.hash_values, key) for key in keys], np.int64)
+        return np.searchsorted(self.tile_keys, keys)
 
     def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float]:
         """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
@@ -332,7 +381,7 @@ class Engine:
 
         def chunk(k: int) -> None:
             kernels.substitute_points(
-                (self.limits[k], self.limits[k + 1]), points, images, lenses, self.loss, self.factor, step, new,
+                (self.shares[k], self.shares[k + 1]), points, images, lenses, self.loss, self.factor, step, new,
                 self.sums[k], self.scratch[k].doubles,
             )  # fmt: skip
 
@@ -380,49 +429,52 @@ def _minimize(engine: Engine, options: AdjustOptions, run: Callable[..., Any], e
     problem = engine.problem
     if problem.num_observations == 0 and engine.extras is None:
         return AdjustReport(termination="nothing")
+    progress = StepProgress(events, len(problem.image_idx), problem.num_observations, options.max_iterations)
     damping, growth, tolerance = options.initial_damping, 2.0, options.relative_cost_tolerance
     first = cost = engine.linearize(damping, run)
     termination, iterations, rejected = "iterations", 0, 0
     if not np.isfinite(cost):
         return AdjustReport(termination="stalled", initial_cost=cost, final_cost=cost)
-    while iterations < options.max_iterations:
-        if events is not None:
-            events.raise_if_cancelled()
-        iterations += 1
-        step = engine.solve()
-        if step is not None:
-            new_cost, predicted = engine.attempt(step, run)
-            if predicted <= 1e-3 * tolerance * cost:
-                # nothing left to gain that would show; take it if it is a gain at all
-                if new_cost < cost:
-                    engine.accept()
-                    cost = new_cost
-                termination = "converged"
-                break
-            gain = (cost - new_cost) / predicted
-            if new_cost < cost and gain > 1e-3:
-                engine.accept()
-                decrease, cost = cost - new_cost, new_cost
-                if decrease <= tolerance * (cost + decrease) or engine.has_settled(
-                    options.settled_sigmas, cost, decrease
-                ):
+    with progress:
+        progress.begin(cost)
+        while iterations < options.max_iterations:
+            iterations += 1
+            step = engine.solve(run)
+            if step is not None:
+                new_cost, predicted = engine.attempt(step, run)
+                if predicted <= 1e-3 * tolerance * cost:
+                    # nothing left to gain that would show; take it if it is a gain at all
+                    if new_cost < cost:
+                        engine.accept()
+                        cost = new_cost
                     termination = "converged"
                     break
-                damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-10)
-                growth = 2.0
-                if iterations < options.max_iterations:
-                    engine.linearize(damping, run)
-                continue
-            if abs(cost - new_cost) <= tolerance * cost:
-                termination = "converged"
+                gain = (cost - new_cost) / predicted
+                if new_cost < cost and gain > 1e-3:
+                    engine.accept()
+                    decrease, cost = cost - new_cost, new_cost
+                    progress.step(cost)
+                    if decrease <= tolerance * (cost + decrease) or engine.has_settled(
+                        options.settled_sigmas, cost, decrease
+                    ):
+                        termination = "converged"
+                        break
+                    damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 1e-10)
+                    growth = 2.0
+                    if iterations < options.max_iterations:
+                        engine.linearize(damping, run)
+                    continue
+                if abs(cost - new_cost) <= tolerance * cost:
+                    termination = "converged"
+                    break
+            rejected += 1
+            progress.step(cost)
+            damping *= growth
+            growth *= 2.0
+            if damping > 1e16:
+                termination = "stalled"
                 break
-        rejected += 1
-        damping *= growth
-        growth *= 2.0
-        if damping > 1e16:
-            termination = "stalled"
-            break
-        engine.linearize(damping, run)
+            engine.linearize(damping, run)
     return AdjustReport(
         termination=termination, num_iterations=iterations, num_rejected=rejected, initial_cost=first, final_cost=cost
     )

@@ -91,7 +91,7 @@ class PlainLines:
         # mapping counts what it registers, some of it twice where models are joined: then nobody knows how long
         if event.total and 0 < event.done <= event.total:
             left = f" of {event.total}, about {took / event.done * (event.total - event.done):.0f} s left"
-        _say(f"{event.stage}: {event.done}{left}")
+        _say(f"{event.stage}: {event.message if event.total is None and event.message else f'{event.done}{left}'}")
 
 
 class Bars:

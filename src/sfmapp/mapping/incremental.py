@@ -94,7 +94,7 @@ def map_images(
         )
     events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
-        task = _Task(names, image_camera_idx, options, adjust_options, events, pool)
+        task = _Task(names, image_camera_idx, options, adjust_options, events, pool, threads)
 
         def map_all(given: list[Camera]) -> Mapped:
             return task.map_from(given, correspondences, tracks)
@@ -148,6 +148,7 @@ class _Task:
     adjust_options: AdjustOptions
     events: Events
     pool: Executor
+    threads: int
 
     def map_from(self, given: list[Camera], correspondences: Correspondences, tracks: Tracks) -> Mapped:
         """Models that begin with the given cameras, from verified matches and their tracks."""
@@ -161,7 +162,7 @@ class _Task:
             return Mapper(
                 reconstruction=model, correspondences=correspondences, options=options,
                 adjust_options=self.adjust_options, events=events, pool=self.pool, prior_cameras=list(cameras),
-                locked=locked, attempts=attempts,
+                locked=locked, attempts=attempts, threads=self.threads,
             )  # fmt: skip
 
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)

@@ -92,7 +92,7 @@ def map_known_poses(
         mapper = Mapper(
             reconstruction=model, correspondences=correspondences, options=options, adjust_options=adjust_options,
             events=events, pool=pool, prior_cameras=list(model.cameras), locked=np.zeros(len(names), bool),
-            held=poses.is_known, poses_tell_centers=True,
+            held=poses.is_known, poses_tell_centers=True, threads=threads,
         )  # fmt: skip
         refuted = _triangulate(mapper)
         is_believed = refuted <= MAX_REFUTED * poses.is_known.sum()

@@ -61,7 +61,7 @@ class Mapper:
     ``waits``: weak images whose strongest pairs are with images outside of the model are left to another one, which
     may grow from there. ``held`` (I,) bool: images whose poses are known and stay as they are; None for none.
     ``poses_tell_centers``: poses are or were known, which tells principal points that EXIF does not. ``widening``: of
-    standard deviations that the residuals give, by what closing adjustments have moved.
+    standard deviations that the residuals give, by what closing adjustments have moved. ``threads``: of adjustments.
     """
 
     reconstruction: Reconstruction
@@ -80,6 +80,7 @@ class Mapper:
     waits: bool = True
     held: NDArray[np.bool_] | None = None
     poses_tell_centers: bool = False
+    threads: int = 1
     widening: float = 1.0
     max_error_px: float = field(init=False)
 
@@ -293,7 +294,7 @@ class Mapper:
         reconstruction.cameras[:] = cameras
         options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
         varying = self._everything(cameras=np.zeros(len(cameras), bool))
-        adjust_bundle(reconstruction, options, varying=varying, prior_cameras=self.prior_cameras)
+        self._adjust(options, varying)
 
     def adjust_globally(self) -> None:
         """Adjust everything, filter, and triangulate again what was lost or has become possible."""
@@ -301,11 +302,18 @@ class Mapper:
         options = replace(self.adjust_options, max_iterations=25, relative_cost_tolerance=1e-4)
         if reconstruction.is_registered.sum() < 3:  # two views cannot tell the lens from the scene
             options = replace(options, refine_focal=False, refine_distortion=False)
-        adjust_bundle(reconstruction, options, varying=self._everything(), prior_cameras=self.prior_cameras)
+        self._adjust(options, self._everything())
         if self.held is not None:  # what does not fit known poses is taken back next
             self._refine_principal_points(options)
         self._settle_points()
         self.size_at_global = self._size()
+
+    def _adjust(self, options: AdjustOptions, varying: Varying) -> None:
+        """Adjust all that varies, on all threads."""
+        adjust_bundle(
+            self.reconstruction, options, varying=varying, prior_cameras=self.prior_cameras, threads=self.threads,
+            events=self.events,
+        )  # fmt: skip
 
     def finish(self) -> None:
         """Adjust until the set of inliers settles; cameras with several images refine their principal point too.
@@ -316,7 +324,7 @@ class Mapper:
         options = replace(self.adjust_options, initial_damping=1e-7, relative_cost_tolerance=1e-7)
         for _ in range(6):
             before = self.reconstruction.obs_is_inlier.copy()
-            adjust_bundle(self.reconstruction, options, varying=self._everything(), prior_cameras=self.prior_cameras)
+            self._adjust(options, self._everything())
             self._refine_principal_points(options)
             self._settle_points()
             changed = int((before != self.reconstruction.obs_is_inlier).sum())
@@ -344,9 +352,9 @@ class Mapper:
         options, chosen = self._polishing()
         graph = FactorGraph(
             reconstruction, round_options(options, num_steps), varying=self._everything(centers=chosen),
-            prior_cameras=self.prior_cameras, noise_px=1.0,
+            prior_cameras=self.prior_cameras, noise_px=1.0, threads=self.threads,
         )  # fmt: skip
-        report = graph.optimize()
+        report = graph.optimize(self.events)
         self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
         self._settle_points()
         made = Round(report, before, reconstruction.obs_is_inlier.copy())
@@ -375,10 +383,11 @@ class Mapper:
             if camera.focal_sigma is not None:
                 priors[c] = replace(camera, focal_sigma=unit * camera.focal_sigma)
         graph = FactorGraph(
-            self.reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=priors, noise_px=unit
-        )
+            self.reconstruction, options, varying=self._everything(centers=chosen), prior_cameras=priors, noise_px=unit,
+            threads=self.threads,
+        )  # fmt: skip
         graph.add(extra_factors)
-        report = graph.optimize()
+        report = graph.optimize(self.events)
         factors = [
             replace(f, normalized_residual=unit * f.normalized_residual) if f.kind == "intrinsics prior" else f
             for f in report.factors
@@ -433,9 +442,7 @@ class Mapper:
         chosen = self._free_principal_points()
         if chosen.any():
             options = self.with_free_centers(options, chosen)
-            adjust_bundle(
-                self.reconstruction, options, varying=self._everything(cameras=chosen), prior_cameras=self.prior_cameras
-            )
+            self._adjust(options, self._everything(cameras=chosen))
 
     def _free_principal_points(self) -> NDArray[np.bool_]:
         """(C,) bool: cameras whose principal point is refined."""

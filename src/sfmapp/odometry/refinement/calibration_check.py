@@ -28,6 +28,7 @@ from sfmapp.camera.lens import BROWN, FAMILY, RADIAL_FISHEYE
 from sfmapp.camera.models import PARAM_NAMES, canonical_from_params, kind_of
 from sfmapp.camera.names import CameraModel
 from sfmapp.contradictions import Contradiction
+from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.geometry.noise import exceeded_by_chance
 from sfmapp.geometry.triangulation import Observed, triangulate_tracks
@@ -274,27 +275,30 @@ def _report(look: _Look, surprise: float, limit: float, unknowns: Unknowns) -> C
 # ------------------------------------------------------------------ what the images say
 
 
-def follow_with_poses(model: Reconstruction, sigma: float) -> float:
+def follow_with_poses(model: Reconstruction, sigma: float, events: Events | None = None) -> float:
     """Adjust poses and points of a map, in place, as closely as a look at its calibration asks for; returns the cost.
 
     Where robust losses let go of single observations, the last steps are many and small: on KITTI 00 half of all.
     """
-    return adjust_poses(model, sigma, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE, _FOLLOWED_SIGMAS)
+    return adjust_poses(model, sigma, _FOLLOWING_STEPS, _FOLLOWING_TOLERANCE, _FOLLOWED_SIGMAS, events)
 
 
 def adjust_poses(
-    model: Reconstruction, sigma: float, max_steps: int, tolerance: float, settled_sigmas: float = 0.0
-) -> float:
+    model: Reconstruction, sigma: float, max_steps: int, tolerance: float, settled_sigmas: float = 0.0,
+    events: Events | None = None,
+) -> float:  # fmt: skip
     """Adjust poses and points of a map, in place, its first keyframe held; returns the cost in units of the noise."""
     options, varying = _of_poses(model, sigma, max_steps, tolerance)
     options = replace(options, settled_sigmas=settled_sigmas)
-    return 2 * adjust_bundle(model, options, varying=varying).final_cost / sigma**2
+    return 2 * adjust_bundle(model, options, varying=varying, events=events).final_cost / sigma**2
 
 
-def close_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance: float) -> AdjustReport:
+def close_poses(
+    model: Reconstruction, sigma: float, max_steps: int, tolerance: float, events: Events | None = None
+) -> AdjustReport:
     """The same as the closing adjustment; twice its final cost is in units of the noise."""
     options, varying = _of_poses(model, sigma, max_steps, tolerance)
-    return FactorGraph(model, options, varying=varying, noise_px=sigma).optimize()
+    return FactorGraph(model, options, varying=varying, noise_px=sigma).optimize(events)
 
 
 def _of_poses(model: Reconstruction, sigma: float, max_steps: int, tolerance: float) -> tuple[AdjustOptions, Varying]:

@@ -102,17 +102,17 @@ def adjust_finally(
     job = make_job(keyframes, everything, everything > 0)
     model = job.model
     # which observations agree is clear long before all have settled
-    adjust_poses(model, residual_scale_px(model, MIN_SIGMA_PX), _FIRST_STEPS, _TOLERANCE)
+    adjust_poses(model, residual_scale_px(model, MIN_SIGMA_PX), _FIRST_STEPS, _TOLERANCE, events=events)
     classify(model, job.num_elsewhere)
     events.raise_if_cancelled()
     sigma = residual_scale_px(model, MIN_SIGMA_PX)
-    cost, found_before = follow_with_poses(model, sigma), None
+    cost, found_before = follow_with_poses(model, sigma, events), None
     events.raise_if_cancelled()
     if given is not None and keyframes.rig is not given:
         found_before, model = (model, cost), _with_rig(model, given)
-        cost = follow_with_poses(model, sigma)
+        cost = follow_with_poses(model, sigma, events)
     answer = _question(model, cost, sigma, options, events, found_before)
-    adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE)
+    adjustment = close_poses(answer.model, sigma, _MAX_STEPS, _TOLERANCE, events)
     num_sensors, of_refinement = len(keyframes.rig.cameras), np.zeros((6, 6))
     if answer.is_refined:
         of_refinement = covariance_of_refinement(model, answer.model, num_sensors) / answer.excess**2
@@ -238,7 +238,7 @@ def _adjust_large_map(
     part = np.arange(num - _NUM_QUESTIONED, num)
     job = make_job(keyframes, part, part > part[0])
     sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
-    cost = adjust_poses(job.model, sigma, _MAX_STEPS, _TOLERANCE)
+    cost = adjust_poses(job.model, sigma, _MAX_STEPS, _TOLERANCE, events=events)
     answer = _question(job.model, cost, sigma, options, events)
     if answer.is_refined:
         keyframes.rig = rig_of(answer.model)

@@ -1,0 +1,175 @@
+"""Large adjustments: batches, products by rows, the envelope, threads, progress. Small scenes stand in for large."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from sfmapp.adjust import progress, solver
+from sfmapp.adjust.elimination import GROUP
+from sfmapp.adjust.envelope import EnvelopeSystem
+from sfmapp.adjust.linear import choose_solver
+from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.solver import adjust_bundle, make_engine
+from sfmapp.camera.camera import project
+from sfmapp.errors import InterruptedRunError
+from sfmapp.events import Events
+from sfmapp.geometry import rigid3
+from sfmapp.scene.synthetic import make_scene, perturb
+
+OPTIONS = AdjustOptions(loss="cauchy", loss_scale_px=1.0)
+
+
+def start_of(scene):
+    noise = {"translation_fraction": 0.01, "point_fraction": 0.01, "focal_fraction": 0.01}
+    return perturb(scene.observed, rotation_deg=0.1, **noise)
+
+
+def normal_equations(model, damping):
+    """The reduced system and its gradient over poses and one camera, from numerical derivatives of all residuals."""
+    engine = make_engine(model, OPTIONS)
+    p = engine.problem
+    num, state = len(p.image_idx), (p.poses.copy(), p.canonical.copy(), p.xyz.copy())
+    num_points, dims = len(p.track_idx), p.block_dim
+    unknowns = int(dims.sum()) + 3 * num_points
+    first = np.cumsum(dims) - dims
+    cut = unknowns - 3 * num_points
+    point = np.repeat(np.arange(num_points), np.diff(p.point_ptr))
+
+    def residuals(step):
+        out = np.empty((p.num_observations, 2))
+        for o in range(p.num_observations):
+            i = p.obs_image[o]
+            w = step[first[i] : first[i] + 6]
+            x = rigid3.apply(state[0][i], state[2][point[o]] + step[cut:].reshape(-1, 3)[point[o]])
+            x = rigid3.exp_so3(w[:3]) @ x + w[3:]
+            params = model.cameras[0].params.copy()
+            params[[0, 3]] += step[first[num] : first[num] + 2]
+            out[o] = project(model.cameras[0].with_params(params), x[None])[0]
+        return (out - p.obs_xy).ravel()
+
+    base, h = residuals(np.zeros(unknowns)), 1e-6
+    J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(unknowns)], 1)
+    weight = np.repeat(1.0 / (1.0 + (base.reshape(-1, 2) ** 2).sum(1)), 2)
+    H, g = J.T @ (weight[:, None] * J), J.T @ (weight * base)
+    H += damping * np.diag(np.diag(H))
+    through = H[:cut, cut:] @ np.linalg.inv(H[cut:, cut:])
+    return H[:cut, :cut] - through @ H[cut:, :cut], g[:cut] - through @ g[cut:]
+
+
+@pytest.mark.parametrize("batch", [10**6, 40])
+def test_a_step_is_that_of_the_normal_equations_however_points_are_batched(monkeypatch, batch):
+    """Against dense algebra on numerical derivatives."""
+    monkeypatch.setattr(solver, "_BATCH_ENTRIES", batch)
+    model = start_of(make_scene(2, 5, 24))
+    system, gradient = normal_equations(model, 1e-3)
+    for name in ("tiles", "envelope"):
+        monkeypatch.setattr(solver, "choose_solver", lambda *_, name=name, **__: name)
+        monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+        engine = make_engine(model, OPTIONS)
+        assert (len(engine.limits) > 2) == (batch == 40)
+        engine.linearize(1e-3, map)
+        step = engine.solve().reshape(-1, 8)[np.arange(8) < engine.problem.block_dim[:, None]]
+        expected = -np.linalg.solve(system, gradient)
+        np.testing.assert_allclose(step, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def random_system(rng, num, met):
+    """Tiles of a positive definite system of blocks of two to eight rows, its matrix, and where tiles are."""
+    dims = rng.integers(2, 9, num)
+    first = np.cumsum(dims) - dims
+    met = np.triu(met | met.T | np.eye(num, dtype=bool))
+    size = int(dims.sum())
+    matrix = np.zeros((size, size))
+    for a, b in zip(*np.nonzero(met), strict=True):
+        matrix[first[a] : first[a] + dims[a], first[b] : first[b] + dims[b]] = rng.normal(size=(dims[a], dims[b]))
+    matrix = np.triu(matrix) + np.triu(matrix, 1).T
+    matrix += np.diag(np.abs(matrix).sum(1) + 0.1)
+    keys = np.flatnonzero(met)
+    tiles = np.zeros((len(keys), 8, 8))
+    for n, (a, b) in enumerate(zip(*np.divmod(keys, num), strict=True)):
+        part = matrix[first[a] : first[a] + dims[a], first[b] : first[b] + dims[b]]
+        tiles[n, : dims[a], : dims[b]] = np.triu(part) if a == b else part
+    return dims, keys, tiles.ravel(), matrix
+
+
+@pytest.mark.parametrize("kind", ["loop", "scattered", "full", "apart", "one"])
+def test_an_envelope_solves_systems_of_any_pattern(kind):
+    rng = np.random.default_rng(0)
+    num = 1 if kind == "one" else 90
+    apart = np.abs(np.arange(num)[:, None] - np.arange(num))
+    met = {
+        "loop": np.minimum(apart, num - apart) < 5, "scattered": rng.random((num, num)) < 0.03,
+        "full": apart >= 0, "apart": apart < 0, "one": apart >= 0,
+    }[kind]  # fmt: skip
+    met[:, -1] |= kind == "loop"  # a camera that all share
+    dims, keys, tiles, matrix = random_system(rng, num, met)
+    system = EnvelopeSystem(dims, keys, np.arange(len(keys)))
+    used = np.arange(8) < dims[:, None]
+    right = rng.normal(size=(num, 8))
+    found = system.solve(tiles, right.ravel()).reshape(-1, 8)
+    np.testing.assert_allclose(found[used], np.linalg.solve(matrix, right[used]), rtol=1e-9, atol=1e-12)
+    assert not found[~used].any()
+    with ThreadPoolExecutor(3) as pool:
+        assert (system.solve(tiles, right.ravel(), pool.map).reshape(-1, 8) == found).all()
+    if kind == "loop":  # both ways round at once, beside the last rows
+        full = EnvelopeSystem(dims, np.flatnonzero(np.triu(np.ones((num, num)))), np.arange(num * (num + 1) // 2))
+        assert system.order.flops < 0.6 * full.order.flops
+    # an indefinite system is told
+    place = int(np.flatnonzero(keys == (num - 1) * (num + 1))[0]) * 64
+    tiles[place] = -1.0
+    assert system.solve(tiles, right.ravel()) is None
+
+
+def test_threads_and_batches_change_nothing(monkeypatch):
+    """The same bytes of one and three threads, chunks of points and parts of rows at work, in groups and beyond one."""
+    monkeypatch.setattr(solver, "_BATCH_ENTRIES", 3000)
+    monkeypatch.setattr(solver, "_CHUNK_OBSERVATIONS", 500)
+    monkeypatch.setattr(solver, "_PART_PRODUCTS", 2000)
+    monkeypatch.setattr(solver, "choose_solver", lambda *_, **__: "envelope")
+    monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+    scene = make_scene(5, 2 * GROUP + 3, 600)
+    states = []
+    for threads in (1, 3):
+        model = start_of(scene)
+        report = adjust_bundle(model, OPTIONS, threads=threads)
+        assert report.solver == "envelope"
+        states.append(model)
+    engine = make_engine(start_of(scene), OPTIONS)
+    assert len(engine.limits) > 1
+    assert engine.num_chunks > 2
+    assert len(engine.parts) > 2
+    assert (states[0].cam_from_world == states[1].cam_from_world).all()
+    assert (states[0].point_xyz == states[1].point_xyz).all()
+    assert (states[0].cameras[0].params == states[1].cameras[0].params).all()
+    monkeypatch.undo()
+    small = start_of(scene)
+    adjust_bundle(small, OPTIONS)
+    np.testing.assert_allclose(states[0].cam_from_world, small.cam_from_world, atol=1e-7)
+
+
+def test_large_systems_are_left_to_the_envelope():
+    for is_closing in (True, False):
+        assert choose_solver(161, 966, 0.01, is_closing=is_closing) == "envelope"
+        assert choose_solver(161, 966, 1.0, is_closing=is_closing) == "envelope"
+    assert choose_solver(160, 960, 0.1, is_closing=True) == "gtsam"
+    assert choose_solver(160, 960, 1.0, is_closing=False) == "tiles"
+
+
+def test_long_adjustments_tell_of_every_step_and_short_ones_of_none(monkeypatch):
+    scene, told = make_scene(1, 4, 60), []
+    adjust_bundle(start_of(scene), OPTIONS, events=Events(told.append))
+    assert not told
+    monkeypatch.setattr(progress, "_LARGE_OBSERVATIONS", 100)
+    report = adjust_bundle(start_of(scene), OPTIONS, events=Events(told.append))
+    assert [event.kind for event in told[:2]] == ["started", "advanced"]
+    assert told[-1].kind == "finished"
+    # the last step, which converges, may be told by the end alone
+    assert report.num_iterations - 1 <= sum(event.kind == "advanced" for event in told) <= report.num_iterations
+    costs = [float(event.message.split("cost ")[1]) for event in told]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[0] == pytest.approx(report.initial_cost, rel=1e-5)
+    assert f"of at most {OPTIONS.max_iterations}" in told[1].message
+    events = Events(lambda event: events.cancel() if event.kind == "advanced" else None)
+    with pytest.raises(InterruptedRunError):
+        adjust_bundle(start_of(scene), OPTIONS, events=events)
