@@ -8,6 +8,8 @@ import pytest
 from sfmapp.camera.camera import Camera, CameraModel, project, simple_camera
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.search import plane_of_matches
+from sfmapp.matching.second_motion import PLANE_SHARE
 from sfmapp.matching.two_view import Ransac, TwoViewGeometry, error_threshold_px, is_significant, verify_pair
 from sfmapp.scene.correspondences import TwoViewConfig
 
@@ -195,6 +197,30 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     first, second = (verify_pair(xy1, xy2, KNOWN, KNOWN, OPTIONS, Ransac(5000, 3)) for _ in range(2))
     for name in ("is_inlier", "fundamental", "essential", "homography", "cam2_from_cam1"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.5, 4), (0.7, 7), (0.75, 5)])
+def test_a_search_draws_no_more_samples_than_the_least_share_asks_for(share: float, size: int) -> None:
+    trials = RANSAC.trials(share, size)
+    is_right = np.random.default_rng(1).random((2000, trials, size)) < share
+    missed = 1.0 - is_right.all(2).any(1).mean()
+    assert missed <= 0.001  # twice as many as find a clean one with a probability of 0.999
+    assert 1.0 - is_right[:, : trials // 20].all(2).any(1).mean() > 0.1
+    assert RANSAC.trials(0.0, size) == RANSAC.trials(0.01, size) == RANSAC.max_trials
+    assert RANSAC.trials(1.0, size) == 1
+
+
+def test_a_plane_of_half_of_the_matches_is_found_from_every_seed() -> None:
+    rng = np.random.default_rng(5)
+    xy1, xy2, _ = views(SIDEWAYS, rng)
+    h = np.array([[0.9, 0.05, 30.0], [-0.04, 1.1, -20.0], [1e-5, 2e-5, 1.0]])
+    num = len(xy1)
+    plane = rng.uniform(100, 700, (num, 2))
+    mapped = np.c_[plane, np.ones(num)] @ h.T
+    both1, both2 = np.r_[xy1, plane], np.r_[xy2, mapped[:, :2] / mapped[:, 2:]]
+    for seed in range(20):
+        _, inlier = plane_of_matches(both1, both2, np.ones(2 * num, bool), 2.0, Ransac(5000, seed), PLANE_SHARE)
+        assert inlier[num:].all()
 
 
 def test_threshold_scales_with_the_image_within_bounds() -> None:

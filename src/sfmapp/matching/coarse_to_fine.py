@@ -120,12 +120,13 @@ def _match_coarse_to_fine(
     if len(coarse) < max(options.min_inliers, 8):
         return None
     xy1, xy2 = _points(image1, image2, coarse)
-    fundamental = find_fundamental(xy1, xy2, threshold_px, ransac)
+    needed = max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse))
+    fundamental = find_fundamental(xy1, xy2, threshold_px, ransac, needed / len(coarse))
     if fundamental is None:
         return None
     fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
     extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
-    if inlier.sum() < max(options.min_inliers, _MIN_COARSE_SHARE * len(coarse)):
+    if inlier.sum() < needed:
         return None
     if not is_significant(inlier, threshold_px, extent):
         return None

@@ -1,8 +1,8 @@
 """Matching along epipolar lines: the whole of two images for the price of a thin band.
 
 All lines of an epipolar geometry pass through the epipole, so one number tells them apart: the angle within the pencil
-of lines. Sorted by it, the features of one image that lie near the line of a feature of the other are neighbours in
-memory, and the products of a few rows with a short run of columns are all that is needed.
+of lines, or what grows with it. Sorted by that, the features of one image that lie near the line of a feature of the
+other are neighbours in memory, and the products of a few rows with a short run of columns are all that is needed.
 """
 
 from __future__ import annotations
@@ -32,9 +32,12 @@ from sfmapp.simd.bits import first_bit
 from sfmapp.simd.dots import DIMS, GROUPS, LANES, ROWS, tile
 
 Array = NDArray[np.float64]
+Order = NDArray[np.int64]
 
 # A feature whose epipolar angle is uncertain by more than this (radians) is compared with all, not sorted in.
 _MAX_HALF_ANGLE = 0.1
+# Into so many bins of the pencil features are sorted: two or three share one, and a run of them takes in two too many.
+_BINS = 4096
 # Features of one image that stand for all that a feature could be mistaken for.
 _BACKGROUND_SAMPLE = 2048
 
@@ -110,10 +113,8 @@ def match_guided(
     """
     rows, columns = _sort_into_pencil(image1, image2, fundamental, band_px)
     row_of, column_of = rows.order, columns.order
-    lines = _Lines(
-        pack_rows(image1.descriptors, row_of), rows.lines, image1.shape[row_of], rows.low, rows.high
-    )  # fmt: skip
-    points = _Points(pack_groups(image2.descriptors, column_of), image2.shape[column_of], columns.angle)
+    lines = _Lines(pack_rows(image1.descriptors, row_of), rows, image1.shape)
+    points = _Points(pack_groups(image2.descriptors, column_of), columns, image2.shape)
     best1 = _none_but_background(image1.background[row_of], len(lines.packed))
     best2 = _none_but_background(image2.background[column_of], len(points.packed) * LANES)
     _scan_band(lines, points, _Gate(float(band_px), change), best1, best2, TileRoom.make())
@@ -129,24 +130,55 @@ def _none_but_background(background: Ints, num: int) -> Best:
     return Best(bound, bound.copy(), np.full(num, -1, np.int32))
 
 
-@dataclass(frozen=True)
-class _Rows:
-    order: NDArray[np.int64]  # (N,) features of image 1 by epipolar angle
-    lines: Array  # (N, 3) their lines in image 2, unit normals
-    low: Array  # (N,) smallest and largest angle of what can lie in the band
-    high: Array
+class _Rows(NamedTuple):
+    """Features of image 1 in the pencil.
+
+    Attributes:
+        order: (N,) features by place. place, reach: (N,) where their lines are, see :func:`_place_of`, and how far from
+            there what lies in the band can be.
+        lines: (N, 3) in image 2, unit normals.
+    """
+
+    order: Order
+    place: Array
+    reach: Array
+    lines: Array
 
 
-@dataclass(frozen=True)
-class _Columns:
-    order: NDArray[np.int64]  # (M,) features of image 2 by angle, then those near the epipole
-    angle: Array  # (F,) angles of the first of them, ascending in 0 to pi
+class _Columns(NamedTuple):
+    """Features of image 2 in the pencil.
+
+    Attributes:
+        order: (M,) features by bin, and behind them those near the epipole.
+        starts: (_BINS + 1,) where each bin begins, and where those near the epipole do.
+    """
+
+    order: Order
+    starts: Order
+
+
+class _Pencil(NamedTuple):
+    """The epipolar lines of image 2.
+
+    Attributes:
+        f: (3, 3) lines of pixels of image 1, in coordinates that centre and scale image 2.
+        normalized_from_pixels: (3, 3) to these coordinates. size: pixels of their unit.
+        p, q: (3,) orthonormal basis of the lines through the epipole.
+        band: largest distance from a line, in their unit.
+    """
+
+    f: Array
+    normalized_from_pixels: Array
+    size: float
+    p: Array
+    q: Array
+    band: float
 
 
 def _sort_into_pencil(
     image1: GuidedImage, image2: GuidedImage, fundamental: Array, band_px: float
 ) -> tuple[_Rows, _Columns]:
-    """Angles of both images' features in the pencil of epipolar lines of image 2.
+    """The features of both images in the pencil of epipolar lines of image 2.
 
     In coordinates that centre and scale image 2, the lines through the epipole e are cos(a) p + sin(a) q for two
     orthonormal p, q. Feature x2 has angle a2 with l(a2) . x2 = 0, and l(a) . x2 = r sin(a - a2), r = |(p.x2, q.x2)|,
@@ -158,79 +190,142 @@ def _sort_into_pencil(
     pixels_from_normalized = np.array([[size, 0.0, center[0]], [0.0, size, center[1]], [0.0, 0.0, 1.0]])
     f = pixels_from_normalized.T @ fundamental
     p, q = np.linalg.svd(np.linalg.svd(f)[0][None, :, 2])[2][1:]
-    angle1, half, lines = np.empty(len(image1.shape)), np.empty(len(image1.shape)), np.empty((len(image1.shape), 3))
-    _line_angles(image1.shape, f, np.linalg.inv(pixels_from_normalized), p, q, band_px / size, angle1, half, lines)
-    angle2, r = np.empty(len(xy2)), np.empty(len(xy2))
-    _point_angles(image2.shape, center, size, p, q, angle2, r)
-    is_near = r * math.sin(_MAX_HALF_ANGLE) < half.max(initial=0.0)
-    far = np.flatnonzero(~is_near)
-    far = far[np.argsort(angle2[far], kind="stable")]
-    half_angle = np.arcsin(np.minimum(half / r[far].min(initial=np.inf), 1.0)) if len(far) else half
-    order = np.argsort(angle1, kind="stable")
-    rows = _Rows(order, lines[order], (angle1 - half_angle)[order], (angle1 + half_angle)[order])
-    return rows, _Columns(np.concatenate([far, np.flatnonzero(is_near)]), angle2[far])
+    pencil = _Pencil(f, np.linalg.inv(pixels_from_normalized), size, p, q, band_px / size)
+    num1, num2 = len(image1.shape), len(xy2)
+    place1, reach, lines = np.empty(num1), np.empty(num1), np.empty((num1, 3))
+    widest = _place_lines(image1.shape, pencil, place1, reach, lines)
+    place2, is_near = np.empty(num2), np.empty(num2, np.bool_)
+    _reach_of(place1, reach, _place_points(image2.shape, pencil, widest, place2, is_near))
+    rows = _Rows(np.empty(num1, np.int64), place1, reach, lines)
+    columns = _Columns(np.empty(num2, np.int64), _no_bins())
+    _sort_by_bin(place1, np.zeros(num1, np.bool_), rows.order, _no_bins())
+    _sort_by_bin(place2, is_near, columns.order, columns.starts)
+    return rows, columns
+
+
+def _no_bins() -> Order:
+    return np.zeros(_BINS + 1, np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
-def _line_angles(
-    shape1: Array, f: Array, normalized_from_pixels: Array, p: Array, q: Array, band: float,
-    angle: Array, half: Array, lines: Array,
-) -> None:  # fmt: skip
-    """Angle of each line in the pencil, band times the length of its normal there, and the line in pixels."""
+def _place_of(x: float, y: float) -> float:
+    """A number in [0, 1] that grows with the angle of (x, y), modulo half a turn, about half as fast as that or up to
+    a whole: ``slope = 0.5 / (|cos| + |sin|)^2``."""
+    if y < 0.0:
+        x, y = -x, -y
+    total = max(abs(x) + y, 1e-300)
+    return 0.5 * y / total if x >= 0.0 else 1.0 - 0.5 * y / total
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_lines(shape1: Array, pencil: _Pencil, place: Array, reach: Array, lines: Array) -> float:
+    """Place of each line in the pencil, band times the length of its normal there, the largest of which is returned,
+    and the line in pixels."""
+    f, p, q, widest = pencil.f, pencil.p, pencil.q, 0.0
     line = np.empty(3)
     for i in range(shape1.shape[0]):
         norm = 0.0
         for k in range(3):
             line[k] = f[k, 0] * shape1[i, 0] + f[k, 1] * shape1[i, 1] + f[k, 2]
             norm += line[k] * line[k]
+        norm = 1.0 / max(math.sqrt(norm), 1e-300)
         for k in range(3):
-            line[k] /= max(math.sqrt(norm), 1e-300)
+            line[k] *= norm
         along_p = line[0] * p[0] + line[1] * p[1] + line[2] * p[2]
         along_q = line[0] * q[0] + line[1] * q[1] + line[2] * q[2]
-        angle[i] = math.atan2(along_q, along_p) % math.pi
-        half[i] = band * math.sqrt(line[0] * line[0] + line[1] * line[1])
+        place[i] = _place_of(along_p, along_q)
+        reach[i] = pencil.band * math.sqrt(line[0] * line[0] + line[1] * line[1])
+        widest = max(widest, reach[i])
         for k in range(3):
             lines[i, k] = (
-                line[0] * normalized_from_pixels[0, k]
-                + line[1] * normalized_from_pixels[1, k]
-                + line[2] * normalized_from_pixels[2, k]
+                line[0] * pencil.normalized_from_pixels[0, k]
+                + line[1] * pencil.normalized_from_pixels[1, k]
+                + line[2] * pencil.normalized_from_pixels[2, k]
             )
-        norm = max(math.sqrt(lines[i, 0] * lines[i, 0] + lines[i, 1] * lines[i, 1]), 1e-300)
+        norm = 1.0 / max(math.sqrt(lines[i, 0] * lines[i, 0] + lines[i, 1] * lines[i, 1]), 1e-300)
         for k in range(3):
-            lines[i, k] /= norm
+            lines[i, k] *= norm
+    return widest
 
 
 @numba.njit(cache=True, nogil=True)
-def _point_angles(shape2: Array, center: Array, size: float, p: Array, q: Array, angle: Array, r: Array) -> None:
-    """Angle of the line through each point in the pencil, and the point's lever r."""
+def _place_points(shape2: Array, pencil: _Pencil, widest: float, place: Array, is_near: NDArray[np.bool_]) -> float:
+    """Place in the pencil of the line through each point, and whether it is so near to the epipole that its angle means
+    nothing; returns the least lever of the others."""
+    p, q, to = pencil.p, pencil.q, pencil.normalized_from_pixels
+    least, limit = math.inf, widest / math.sin(_MAX_HALF_ANGLE)
     for i in range(shape2.shape[0]):
-        x, y = (shape2[i, 0] - center[0]) / size, (shape2[i, 1] - center[1]) / size
+        x, y = to[0, 0] * shape2[i, 0] + to[0, 2], to[1, 1] * shape2[i, 1] + to[1, 2]
         along_p, along_q = x * p[0] + y * p[1] + p[2], x * q[0] + y * q[1] + q[2]
-        angle[i] = math.atan2(-along_p, along_q) % math.pi
-        r[i] = math.sqrt(along_p * along_p + along_q * along_q)
+        place[i] = _place_of(along_q, -along_p)
+        lever = math.sqrt(along_p * along_p + along_q * along_q)
+        is_near[i] = lever < limit
+        if not is_near[i]:
+            least = min(least, lever)
+    return least
+
+
+@numba.njit(cache=True, nogil=True)
+def _reach_of(place: Array, reach: Array, lever: float) -> None:
+    """Make of band times normal how far from its place in the pencil what lies in the band can be.
+
+    Its angle is off by no more than arcsin(reach / lever), at most _MAX_HALF_ANGLE; the slope of the place is at most a
+    half, and grows by less than a quarter over that angle.
+    """
+    for i in range(place.shape[0]):
+        angle = math.asin(min(reach[i] / lever, 1.0))
+        # |sin| and |cos| over their sum are s and 1 - s
+        s = 2.0 * place[i] if place[i] < 0.5 else 2.0 - 2.0 * place[i]
+        slope = 0.5 * (s * s + (1.0 - s) * (1.0 - s))
+        reach[i] = angle * min(1.3 * slope, 0.5) + 1e-9
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_by_bin(place: Array, is_last: NDArray[np.bool_], order: Order, starts: Order) -> None:
+    """Fill the positions by bin of their place, as they come within one, those that are last behind all bins; and
+    starts (_BINS + 1,), zeros before, with where each bin begins and the last do."""
+    num, num_sorted = place.shape[0], 0
+    for i in range(num):
+        if not is_last[i]:
+            starts[_bin_of(place[i])] += 1
+            num_sorted += 1
+    total = 0
+    for k in range(_BINS):
+        starts[k], total = total, total + starts[k]
+    starts[_BINS] = num_sorted
+    last = num_sorted
+    for i in range(num):
+        if is_last[i]:
+            order[last] = i
+            last += 1
+        else:
+            k = _bin_of(place[i])
+            order[starts[k]] = i
+            starts[k] += 1
+    for k in range(_BINS - 1, 0, -1):
+        starts[k] = starts[k - 1]
+    starts[0] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _bin_of(place: float) -> int:
+    return min(max(int(place * _BINS), 0), _BINS - 1)
 
 
 class _Lines(NamedTuple):
-    """The features of image 1 in the order of their angles.
-
-    Attributes:
-        packed: (N', ...) descriptors, see ``pack_rows``.
-        lines: (N, 3) in image 2. shape: (N, 4). low, high: (N,) angles, see :class:`_Rows`.
-    """
+    """Features of image 1: packed descriptors (N', ...) in their order, see ``pack_rows``, and (N, 4) shapes."""
 
     packed: Packed
-    lines: Array
+    rows: _Rows
     shape: Array
-    low: Array
-    high: Array
 
 
 class _Points(NamedTuple):
-    """Those of image 2: packed descriptors, see ``pack_groups``, shape (M, 4) and angle (F,), see :class:`_Columns`."""
+    """Those of image 2: packed descriptors in their order, see ``pack_groups``, and (M, 4) shapes."""
 
     packed: Packed
+    columns: _Columns
     shape: Array
-    angle: Array
 
 
 class _Gate(NamedTuple):
@@ -247,13 +342,12 @@ def _scan_run(
 ) -> None:  # fmt: skip
     """Products of ROWS rows with a run of columns; what lies outside the band is dropped afterwards."""
     width, (first, last) = LANES * GROUPS, run
-    a, packed, lines, shape1, shape2 = image1.packed, image2.packed, image1.lines, image1.shape, image2.shape
     band, change = gate
     first1, second1, partner1 = best1
     first2, second2, partner2 = best2
     sums, masks = room
     for group in range(first // width * GROUPS, (last + width - 1) // width * GROUPS, GROUPS):
-        if not tile(a, packed, row, group, sums, masks, second1, second2):
+        if not tile(image1.packed, image2.packed, row, group, sums, masks, second1, second2):
             continue
         for r in range(ROWS):
             i, left = row + r, masks[r]
@@ -263,12 +357,14 @@ def _scan_run(
                 j = group * LANES + q
                 if j < first or j >= last:
                     continue
-                if abs(lines[i, 0] * shape2[j, 0] + lines[i, 1] * shape2[j, 1] + lines[i, 2]) > band:
+                of1, of2 = image1.rows.order[i], image2.columns.order[j]
+                line, shape1, shape2 = image1.rows.lines[of1], image1.shape[of1], image2.shape[of2]
+                if abs(line[0] * shape2[0] + line[1] * shape2[1] + line[2]) > band:
                     continue
-                log_scale = shape2[j, 2] - shape1[i, 2]
+                log_scale = shape2[2] - shape1[2]
                 if log_scale < change[0] or log_scale > change[1]:
                     continue
-                turn = shape2[j, 3] - shape1[i, 3] - change[2]
+                turn = shape2[3] - shape1[3] - change[2]
                 if abs(turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)) > change[3]:
                     continue
                 keep_two_largest(first1, second1, partner1, i, j, sums[r, q])
@@ -276,36 +372,26 @@ def _scan_run(
 
 
 @numba.njit(cache=True, nogil=True)
-def _first_above(ascending: Array, value: float) -> int:
-    low, high = 0, ascending.shape[0]
-    while low < high:
-        middle = (low + high) // 2
-        if ascending[middle] > value:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@numba.njit(cache=True, nogil=True)
 def _scan_band(image1: _Lines, image2: _Points, gate: _Gate, best1: Best, best2: Best, room: TileRoom) -> None:
-    low, high, angle2 = image1.low, image1.high, image2.angle
-    num_rows, num_far, num_all = low.shape[0], angle2.shape[0], image2.shape.shape[0]
+    rows, (of_column, starts) = image1.rows, image2.columns
+    num_rows, num_all = rows.order.shape[0], of_column.shape[0]
     for row in range(0, num_rows, ROWS):
-        smallest, largest = low[row], high[row]
-        for i in range(row + 1, min(row + ROWS, num_rows)):
-            smallest, largest = min(smallest, low[i]), max(largest, high[i])
-        # angles are modulo pi: a run that leaves 0 to pi goes on at the other end
-        starts = (_first_above(angle2, smallest), _first_above(angle2, smallest + math.pi), 0, num_far)
-        ends = (
-            _first_above(angle2, largest), num_far,
-            _first_above(angle2, largest - math.pi), num_all,
-        )  # fmt: skip
-        if largest - smallest >= math.pi:
-            starts, ends = (0, 0, 0, num_far), (num_far, 0, 0, num_all)
-        for run in range(4):
-            if starts[run] < ends[run]:
-                _scan_run(image1, image2, gate, row, (starts[run], ends[run]), best1, best2, room)
+        low, high = math.inf, -math.inf
+        for i in range(row, min(row + ROWS, num_rows)):
+            n = rows.order[i]
+            low, high = min(low, rows.place[n] - rows.reach[n]), max(high, rows.place[n] + rows.reach[n])
+        # places are modulo 1: a run that leaves 0 to 1 goes on at the other end
+        runs = (
+            (starts[_bin_of(low)], starts[_bin_of(high) + 1]),
+            (starts[_bin_of(low + 1.0)] if low < 0.0 else starts[_BINS], starts[_BINS]),
+            (0, starts[_bin_of(high - 1.0) + 1] if high > 1.0 else 0),
+            (starts[_BINS], num_all),
+        )
+        if high - low >= 1.0:
+            runs = ((0, starts[_BINS]), (0, 0), (0, 0), (starts[_BINS], num_all))
+        for run in runs:
+            if run[0] < run[1]:
+                _scan_run(image1, image2, gate, row, run, best1, best2, room)
 
 
 def compile_kernels() -> None:

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 STAGE = "pairs"
 
-# descriptors that the vocabulary is learnt from: a thousand for each of 64 words, 32 MB as float32
-_SAMPLE_SIZE = 65536
+# descriptors that the vocabulary is learnt from: 256 for each of 64 words, beyond which faiss takes no more either
+_SAMPLE_SIZE = 16384
 _KMEANS_ROUNDS = 12
 # length of an image vector in whole numbers: its square must stay below 2^24
 _VLAD_LENGTH = 4000
@@ -249,10 +249,14 @@ def _nearest_word(descriptors: NDArray[np.float32], words: NDArray[np.float32]) 
 
 def _sum_by_word(descriptors: NDArray[np.float32], nearest: NDArray[np.int64], num_words: int) -> NDArray[np.float64]:
     """(K, D) sum of the descriptors of each word."""
-    order = np.argsort(nearest, kind="stable")
-    found, starts = np.unique(nearest[order], return_index=True)
     total = np.zeros((num_words, descriptors.shape[1]))
-    total[found] = np.add.reduceat(descriptors[order], starts, axis=0, dtype=np.float64)
+    # no more than 65536 at a time, so that sums of numbers below 256 are exact
+    step = min(max(1, _BLOCK_BYTES // (4 * num_words)), 1 << 16)
+    for start in range(0, len(descriptors), step):
+        block = descriptors[start : start + step]
+        is_of_word = np.zeros((num_words, len(block)), np.float32)
+        is_of_word[nearest[start : start + step], np.arange(len(block))] = 1.0
+        total += is_of_word @ block
     return total
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import epipolar, five_point
+from sfmapp.geometry import epipolar, five_point, homography
 from sfmapp.geometry.fit import CAUCHY_SIGMAS, HEAVY_TAILS, robust_sigma
 from sfmapp.geometry.relative_pose import refine_on_inliers, refine_relative_pose
 
@@ -23,6 +23,13 @@ Ints = NDArray[np.int64]
 _SAMPLES, _REFINED, _FEW, _ROUNDS = 15, 4, 200, 8
 # what the threshold of normalised image points becomes where OpenCV expects pixels
 _SEARCH_PX = 2.0
+# A search ends when a sample without a wrong match has been drawn with this probability.
+_CONFIDENCE = 0.999
+# Of such samples some lead to models that miss many of the right matches: so many times as many are drawn before a
+# model that explains enough is given up.
+_SPARE = 2.0
+# Matches that leave the eight numbers of a plane open by less than a tenth of their noise.
+_MANY = 1000
 
 
 @dataclass(frozen=True)
@@ -32,13 +39,22 @@ class Ransac:
     max_trials: int
     seed: int
 
-    def params(self, threshold: float) -> Any:
+    def trials(self, least_share: float, sample_size: int) -> int:
+        """Hypotheses after which a model that explains at least this share of the matches would have been found; one
+        that explains fewer is worth nothing to the caller."""
+        clean = least_share**sample_size
+        if clean <= 0.0 or clean >= 1.0:
+            return 1 if clean > 0.0 else self.max_trials
+        wanted = _SPARE * math.log(1.0 - _CONFIDENCE) / math.log1p(-clean)
+        return math.ceil(min(wanted, self.max_trials))
+
+    def params(self, threshold: float, least_share: float, sample_size: int) -> Any:
         """MAGSAC++ scores (Barath et al., CVPR 2020) with local optimisation, in OpenCV's USAC framework."""
         import cv2
 
         params = cv2.UsacParams()
-        params.confidence = 0.999
-        params.maxIterations = self.max_trials
+        params.confidence = _CONFIDENCE
+        params.maxIterations = self.trials(least_share, sample_size)
         params.threshold = threshold
         params.score = cv2.SCORE_METHOD_MAGSAC
         params.loMethod = cv2.LOCAL_OPTIM_SIGMA
@@ -92,33 +108,53 @@ def first_matrix(found: Any) -> Array | None:
     return matrix / norm if norm > 0 else None
 
 
-def find_fundamental(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) -> Array | None:
-    """F (3, 3) by RANSAC from matched pixels (N, 2), N >= 8, or None."""
+def find_fundamental(
+    xy1: Array, xy2: Array, threshold: float, ransac: Ransac, least_share: float = 0.0
+) -> Array | None:
+    """F (3, 3) by RANSAC from matched pixels (N, 2), N >= 8, or None; see :meth:`Ransac.trials` of the least share."""
     import cv2
 
     try:
-        return first_matrix(cv2.findFundamentalMat(xy1, xy2, ransac.params(threshold))[0])
+        return first_matrix(cv2.findFundamentalMat(xy1, xy2, ransac.params(threshold, least_share, 7))[0])
     except cv2.error:  # coincident points can leave it without a single valid sample
         return None
 
 
-def find_homography(xy1: Array, xy2: Array, threshold: float, ransac: Ransac) -> Array | None:
+def find_homography(xy1: Array, xy2: Array, threshold: float, ransac: Ransac, least_share: float = 0.0) -> Array | None:
     """H (3, 3) by RANSAC from matched pixels (N, 2), or None."""
     import cv2
 
     try:
-        return first_matrix(cv2.findHomography(xy1, xy2, ransac.params(threshold))[0])
+        return first_matrix(cv2.findHomography(xy1, xy2, ransac.params(threshold, least_share, 4))[0])
     except cv2.error:
         return None
 
 
-def find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac) -> Array | None:
+def plane_of_matches(
+    xy1: Array, xy2: Array, pool: Mask, threshold: float, ransac: Ransac, least_share: float
+) -> tuple[Array, Mask]:
+    """H (3, 3) by RANSAC from some of the matches (N, 2), and (N,) which of all it explains; NaN, and none, without.
+
+    Args:
+        pool: (N,) bool, those that it is sought among.
+        least_share: of the pool, to be worth having.
+    """
+    few = np.flatnonzero(pool)
+    few = few[:: max(-(-len(few) // _MANY), 1)]
+    h = find_homography(xy1[few], xy2[few], threshold, ransac, least_share)
+    if h is None:
+        return np.full((3, 3), np.nan), np.zeros(len(xy1), bool)
+    return h, homography.transfer_errors(h, xy1, xy2) < threshold**2
+
+
+def find_essential(xn1: Array, xn2: Array, threshold: float, ransac: Ransac, least_share: float = 0.0) -> Array | None:
     """E (3, 3) of unit norm by RANSAC from normalised image points (N, 2), or None; the threshold in their units."""
     import cv2
 
     eye, no_distortion = np.eye(3), np.zeros(4)
     try:
-        found = cv2.findEssentialMat(xn1, xn2, eye, eye, no_distortion, no_distortion, ransac.params(threshold))[0]
+        params = ransac.params(threshold, least_share, 5)
+        found = cv2.findEssentialMat(xn1, xn2, eye, eye, no_distortion, no_distortion, params)[0]
     except cv2.error:
         return None
     e = first_matrix(found)

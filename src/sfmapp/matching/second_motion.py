@@ -10,16 +10,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import homography
 from sfmapp.geometry.fundamental_refinement import polish_fundamental
 from sfmapp.matching.options import MatchingOptions
-from sfmapp.matching.search import Ransac, find_fundamental, find_homography, is_significant
+from sfmapp.matching.search import Ransac, find_fundamental, is_significant, plane_of_matches
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Share of the inliers of the epipolar geometry that must lie on the plane: below it the plane did not choose it.
-_PLANE_SHARE = 0.5
+PLANE_SHARE = 0.5
 # Of the matches off the plane the second geometry must explain so many times as many as the first does. The right
 # geometry of a plane with relief explains nearly all that another one can.
 _MIN_GAIN = 1.25
@@ -37,10 +36,7 @@ def has_second_motion(
     ransac: Ransac,
 ) -> bool:
     """Whether a plane has chosen the epipolar geometry of matches that on the whole have another."""
-    plane = find_homography(xy1[inlier_f], xy2[inlier_f], threshold, ransac)
-    if plane is None:
-        return False
-    inlier_h = homography.transfer_errors(plane, xy1, xy2) < threshold**2
+    _, inlier_h = plane_of_matches(xy1, xy2, inlier_f, threshold, ransac, PLANE_SHARE)
     return geometry_off_plane(xy1, xy2, inlier_f, inlier_h, threshold, extent, options, ransac) is not None
 
 
@@ -65,14 +61,14 @@ def geometry_off_plane(
         F (3, 3), or None.
     """
     on_plane = int(inlier_h.sum())
-    if on_plane <= _PLANE_SHARE * inlier_f.sum():
+    if on_plane <= PLANE_SHARE * inlier_f.sum():
         return None
     rest = np.flatnonzero(~inlier_h)
     needed = max(options.min_inliers, _MIN_GAIN * inlier_f[rest].sum(), _MIN_SHARE * on_plane)
     if len(rest) < needed:
         return None
     a, b = xy1[rest], xy2[rest]
-    found = find_fundamental(a, b, threshold, ransac)
+    found = find_fundamental(a, b, threshold, ransac, needed / len(rest))
     if found is None:
         return None
     fundamental, explained = polish_fundamental(found, a, b, threshold, ransac.seed)

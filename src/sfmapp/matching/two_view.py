@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_normalized, pixels_to_rays
 from sfmapp.geometry import epipolar, five_point, homography, rigid3
 from sfmapp.geometry.fundamental_refinement import polish_fundamental
+from sfmapp.geometry.turned_views import turn_at_focal, turn_costs
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import (
     Ransac,
@@ -22,11 +23,11 @@ from sfmapp.matching.search import (
     essentials_of_samples,
     find_essential,
     find_fundamental,
-    find_homography,
     is_significant,
     is_significant_of_rays,
+    plane_of_matches,
 )
-from sfmapp.matching.second_motion import geometry_off_plane
+from sfmapp.matching.second_motion import PLANE_SHARE, geometry_off_plane
 from sfmapp.scene.correspondences import TwoViewConfig
 
 Array = NDArray[np.float64]
@@ -165,7 +166,7 @@ def _verify(
     threshold = error_threshold_px(camera1, camera2, options)
     inliers = _Inliers(*(np.zeros(len(xy1), bool) for _ in range(3)))
     if fundamental is None:
-        fundamental = find_fundamental(xy1, xy2, threshold, ransac)
+        fundamental = find_fundamental(xy1, xy2, threshold, ransac, min(options.min_inliers / len(xy1), 1.0))
         if fundamental is not None:
             fundamental, _ = polish_fundamental(fundamental, xy1, xy2, threshold, ransac.seed)
     if fundamental is not None:
@@ -173,8 +174,10 @@ def _verify(
         if not is_significant(inliers.f, threshold, (camera2.width, camera2.height)):
             inliers.f[:] = False
     # a homography that holds where F does not is still worth having, so it looks at all matches in that case
-    pool = inliers.f if inliers.f.any() else np.ones(len(xy1), bool)
-    result.homography, inliers.h = _estimate_homography(xy1, xy2, pool, threshold, ransac)
+    pool, least_share = inliers.f, PLANE_SHARE
+    if not pool.any():
+        pool, least_share = np.ones(len(xy1), bool), min(options.min_inliers / len(xy1), 1.0)
+    result.homography, inliers.h = plane_of_matches(xy1, xy2, pool, threshold, ransac, least_share)
     poses = _RelativePoses(xy1, xy2, camera1, camera2, threshold)
     is_calibrated = camera1.focal_source != "default" and camera2.focal_source != "default"
     _estimate_pose(result, inliers, poses, is_calibrated, ransac, options)
@@ -218,13 +221,6 @@ def _classify(result: TwoViewGeometry, inliers: _Inliers, is_calibrated: bool, o
         result.config = TwoViewConfig.PLANAR_OR_PANORAMIC
         if num_h > result.is_inlier.sum():
             result.is_inlier = inliers.h
-
-
-def _estimate_homography(xy1: Array, xy2: Array, pool: Mask, threshold: float, ransac: Ransac) -> tuple[Array, Mask]:
-    h = find_homography(xy1[pool], xy2[pool], threshold, ransac)
-    if h is None:
-        return _no_matrix(), np.zeros(len(xy1), bool)
-    return h, homography.transfer_errors(h, xy1, xy2) < threshold**2
 
 
 class _RelativePoses:
@@ -283,7 +279,9 @@ def _estimate_pose(
     explained = epipolar.sampson_errors(epipolar.essential_from_pose(pose), xn1[pool], xn2[pool]) < poses.scale**2
     is_astray = ransac.max_trials * mask.mean() ** 7 < _SURE_SAMPLES or explained.mean() < options.min_e_f_ratio
     if is_calibrated and is_astray:
-        found = find_essential(xn1, xn2, 0.5 * poses.scale, ransac)
+        # of what E explains, a part of the matches that were left out of xn1 is
+        needed = max(options.min_inliers, options.min_e_f_ratio * (inliers.f.sum() - _FREER))
+        found = find_essential(xn1, xn2, 0.5 * poses.scale, ransac, min(needed / len(mask), 1.0))
         if found is not None:
             both = np.stack([epipolar.essential_from_pose(pose), found])
             pose = best_relative_pose(both, np.arange(len(xn1)), xn1, xn2, limit)
@@ -371,24 +369,12 @@ def _tell_planar_apart(result: TwoViewGeometry, inlier_h: Mask, poses: _Relative
     few = slice(None, None, max(len(a) // 200, 1))
     log_focal, reach = 0.0, math.log(1.3 if is_calibrated else 2.0)
     for _ in range(3):  # a grid within a grid leaves 2 % of focal, then 0.5 %
-        rotation, errors = _rotation_only(a, b, poses.scale, log_focal)
+        rotation, errors = turn_at_focal(a, b, poses.scale, log_focal)
         if (errors < 1.0).mean() > _TURNED_SHARE:
             result.config, result.is_inlier = TwoViewConfig.PANORAMIC, inlier_h
             result.cam2_from_cam1 = rigid3.from_matrix(rotation, np.zeros(3))
             result.essential, result.median_angle_deg = _no_matrix(), 0.0
             return
         trials = log_focal + reach * np.linspace(-1.0, 1.0, 9)
-        costs = [np.minimum(_rotation_only(a[few], b[few], poses.scale, trial)[1], 1.0).sum() for trial in trials]
-        log_focal = float(trials[np.argmin(costs)])
+        log_focal = float(trials[np.argmin(turn_costs(a[few], b[few], poses.scale, trials))])
         reach *= 0.25
-
-
-def _rotation_only(xn1: Array, xn2: Array, scale: float, log_focal: float) -> tuple[Array, Array]:
-    """The rotation that fits best at a multiple of the focal, and (N,) squared errors in units of scale."""
-    factor = math.exp(-log_focal)
-    weights, a, b, bound = np.ones(len(xn1)), xn1 * factor, xn2 * factor, (scale * factor) ** 2
-    for _ in range(3):
-        rotation = homography.rotation_from_rays(a, b, weights)
-        error = np.minimum(homography.transfer_errors(rotation, a, b) / bound, 1e12)
-        weights = 1.0 / (1.0 + error)
-    return rotation, error
