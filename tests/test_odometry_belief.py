@@ -15,12 +15,12 @@ from rendered_worlds.symmetric import CAMERA
 from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.belief import particles
-from sfmapp.odometry.belief.belief import MAX_DOUBT, OwnFrame, PlaceBelief
-from sfmapp.odometry.belief.evidence import Tally, log_ratio
-from sfmapp.odometry.belief.look_alikes import LookAlikes
+from sfmapp.odometry.belief.belief import OwnFrame, PlaceBelief
 from sfmapp.odometry.belief.particles import MAX_PARTICLES, MIN_PARTICLES, Particles, drawn, kld_number
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pyramid import build_pyramid
+from sfmapp.odometry.loops.evidence import MAX_DOUBT, Tally, log_ratio
+from sfmapp.odometry.loops.look_alikes import LookAlikes
 from sfmapp.odometry.loops.place_recognition import PlaceIndex, View
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.scene.rig import Rig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from sfmapp.camera.camera import CameraModel, project, simple_camera
 from sfmapp.geometry import rigid3, similarity
@@ -17,6 +19,7 @@ from sfmapp.odometry.frontend.pyramid import build_pyramid
 from sfmapp.odometry.loops import relocalize as relocalization
 from sfmapp.odometry.loops.closing import apply_closure, fuse_points, join_maps
 from sfmapp.odometry.loops.detection import LoopFinder, LoopOptions
+from sfmapp.odometry.loops.evidence import MAX_DOUBT, log_ratio_of_share
 from sfmapp.odometry.loops.place_recognition import Candidate, PlaceIndex, PlaceOptions, View
 from sfmapp.odometry.loops.pose_graph import apply_corrections
 from sfmapp.odometry.loops.relocalize import (
@@ -27,6 +30,7 @@ from sfmapp.odometry.loops.relocalize import (
     relocalize,
     twist,
 )
+from sfmapp.odometry.loops.rivals import are_seen_apart, log_ratio_of_shift
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.map.local_map import View as FrameView
 from sfmapp.odometry.recognition import Recognition
@@ -487,6 +491,44 @@ def test_a_wall_that_repeats_half_of_itself_is_no_loop(wall: Wall) -> None:
     image = wall.image.copy()
     image[:475, 960:1600] = image[:475, 320:960]
     assert not walk_along(image, LoopOptions(max_drift_mono=10.0))
+
+
+def test_a_wall_of_equal_bays_is_no_loop_wherever_the_map_could_be(wall: Wall) -> None:
+    """Every four metres all is as before: what is seen is there alone nowhere, whatever the way could have lost."""
+    image = np.tile(wall.image[:, 320:640], (1, 6))
+    assert not walk_along(image, LoopOptions(max_drift_mono=10.0))
+
+
+def test_points_that_one_image_shows_apart_are_two() -> None:
+    keyframes = KeyframeMap(Rig.single(CAMERA))
+    old, new = keyframes.new_points(20), keyframes.new_points(20)
+    rng = np.random.default_rng(0)
+    for n, ids in enumerate((old, np.concatenate([old[10:], new[10:]]), new)):
+        xy = rng.uniform([0, 0], [320, 240], (len(ids), 1, 2))
+        if n == 1:  # the last five pairs lie on each other
+            xy[15:] = xy[5:10] + 1.0
+        keyframes.append(Keyframe(n, 0.0, str(n), rigid3.IDENTITY, ids, xy, np.ones((len(ids), 1), bool)))
+    assert are_seen_apart(keyframes, new, old, 12.0)
+    assert are_seen_apart(keyframes, new[10:15], old[10:15], 12.0)
+    assert not are_seen_apart(keyframes, new[:10], old[:10], 12.0)  # no image shows both
+    assert not are_seen_apart(keyframes, new[15:], old[15:], 12.0)
+    assert not are_seen_apart(keyframes, new[:11], old[:11], 12.0)  # one wrong match among eleven is none too many
+    assert not are_seen_apart(keyframes, old, old, 12.0)
+    assert not are_seen_apart(keyframes, np.full(5, -1), old[:5], 12.0)
+
+
+def test_shares_and_shifts_are_weighed_as_likelihoods() -> None:
+    for num, total, expected in ((7, 20, 0.1), (20, 20, 0.1), (3, 20, 0.05)):
+        log = binom.logpmf(num, total, num / total) - binom.logpmf(num, total, expected)
+        assert log_ratio_of_share(num, total, expected) == pytest.approx(log)
+    assert log_ratio_of_share(2, 20, 0.1) == log_ratio_of_share(0, 20, 0.1) == log_ratio_of_share(0, 0, 0.1) == 0.0
+    # both are densities: the ratio over all shifts of look-alikes, even over a disk, has the mean one
+    edges = np.geomspace(1e-3, 1.0, 20001)
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    ratio = np.exp([log_ratio_of_shift(shift) for shift in middle])
+    assert (ratio * np.diff(edges**2)).sum() == pytest.approx(1.0, abs=1e-3)
+    assert log_ratio_of_shift(0.0) == log_ratio_of_shift(1e-3) > -math.log(MAX_DOUBT)
+    assert log_ratio_of_shift(1.0) < 0.0
 
 
 def test_a_correction_that_nobody_could_have_lost_is_refused(wall: Wall) -> None:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import pixels_to_normalized
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.belief.evidence import Score, Tally
 from sfmapp.odometry.belief.particles import MIN_PARTICLES, Particles, drawn
 from sfmapp.odometry.belief.scene import KnownScene
 from sfmapp.odometry.loops.detection import LoopOptions, initial_similarity, seen_in
+from sfmapp.odometry.loops.evidence import MAX_DOUBT, NOT_IN_MAP, Score, Tally, log_prior
 from sfmapp.odometry.loops.place_recognition import Bytes, Candidate, PlaceIndex, View
 from sfmapp.odometry.loops.relocalize import (
     Located,
@@ -31,6 +31,7 @@ from sfmapp.odometry.loops.relocalize import (
     is_elsewhere,
     locate,
     position_of,
+    seen_as_before,
 )
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.report import BeliefReport
@@ -38,11 +39,6 @@ from sfmapp.odometry.snapshot import BeliefState
 
 Array = NDArray[np.float64]
 
-# All that speaks against a place that is believed: of a thousand cameras that believe to know where they are, one does
-# not, as far as the likelihoods are right.
-MAX_DOUBT = 1e-3
-# Probability, beforehand, that the camera is not in the map; the places of the map share the rest.
-_NOT_IN_MAP = 0.5
 # Looks that are kept, to judge places by them that are thought of later.
 _NUM_LOOKS = 12
 # Most places that are looked at, and the log likelihood ratio below which a place is no longer looked at.
@@ -132,14 +128,14 @@ class PlaceBelief:
         self._num_looks_to_decision: int | None = None
         self.modes: list[Mode] = []
         self.decided: Mode | None = None
-        self.not_in_map = _NOT_IN_MAP
+        self.not_in_map = NOT_IN_MAP
         self._stretch: int | None = None
         self._looks: list[_Look] = []
 
     def reset(self) -> None:
         """Forget where the camera may be: it was lost, or the map has changed."""
         self.modes, self.decided, self._looks, self._stretch = [], None, [], None
-        self.not_in_map = _NOT_IN_MAP
+        self.not_in_map = NOT_IN_MAP
 
     def look(self, keyframes: KeyframeMap, view: View, roll: float = 0.0, own: OwnFrame | None = None) -> None:
         """Judge all places by another image.
@@ -290,7 +286,7 @@ class PlaceBelief:
             held = None
         if held is not None:
             pose = held[0].cam_from_world
-        expected = local.subset(self._scene.expects(local, pose))
+        expected = local.subset(seen_as_before(self._scene.keyframes, local, pose))
         expected = expected.subset(np.arange(0, len(expected.point_id), 1 + len(expected.point_id) // _MAX_EXPECTED))
         point_id, agrees = agreeing_at(expected, look.view, camera, pose)
         mode.tally.add(point_id, agrees)
@@ -328,8 +324,8 @@ class PlaceBelief:
             mode.score = mode.tally.score(look_alikes.cluster, clusters)
             if mode.score.support > 0.0:
                 mode.score = mode.tally.score(look_alikes.cluster, clusters[look_alikes.is_repeated(clusters)])
-        share = math.log((1.0 - _NOT_IN_MAP) / max(len(self._scene.frame_idx), 1))
-        logs = np.array([math.log(_NOT_IN_MAP), *[share + mode.score.total for mode in self.modes]])
+        share = log_prior(len(self._scene.frame_idx))
+        logs = np.array([math.log(NOT_IN_MAP), *[share + mode.score.total for mode in self.modes]])
         shares = np.exp(logs - logs.max())
         shares /= shares.sum()
         self.not_in_map = float(shares[0])

@@ -1,6 +1,6 @@
 """What the landmarks of a model of photographs say of the place that one more photograph was put at.
 
-As :mod:`sfmapp.odometry.belief.evidence` has it for a sequence: landmarks that should be in view look there as they did
+As :mod:`sfmapp.odometry.loops.evidence` has it for a sequence: landmarks that should be in view look there as they did
 in photographs beside it, or not. A place that only looks alike lacks what distinguishes the true one.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, project
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.belief.evidence import Score, Tally
+from sfmapp.odometry.loops.evidence import Score, Tally
 from sfmapp.odometry.loops.place_recognition import SIGMA_PX, View
 from sfmapp.odometry.loops.relocalize import LocalPoints, agreeing_at
 from sfmapp.scene.reconstruction import Reconstruction

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
-from sfmapp.odometry.belief.look_alikes import LookAlikes
+from sfmapp.odometry.loops.look_alikes import LookAlikes
 from sfmapp.odometry.loops.place_recognition import Bytes, PlaceIndex
 from sfmapp.odometry.loops.pose_graph import keyframe_depths
 from sfmapp.odometry.loops.relocalize import LocalPoints, local_points, position_of
@@ -17,10 +16,6 @@ from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.map.known_map import PREFIX
 
 Array = NDArray[np.float64]
-
-# Landmarks are expected where they are seen from a side as before: within this angle, at a distance between these
-# shares of that (what descriptors bear).
-_MAX_ASIDE_DEG, _DISTANCE_SHARES = 35.0, (0.6, 1.6)
 
 
 class KnownScene:
@@ -42,7 +37,6 @@ class KnownScene:
         pose = np.array([keyframes.keyframes[k].rig_from_world for k in known]).reshape(-1, 7)
         self.depth = keyframe_depths(keyframes)[known]
         self._center, self._axis = rigid3.center(pose), rigid3.rotation_matrix(pose)[:, 2]
-        self._centers = rigid3.center(np.array([k.rig_from_world for k in keyframes.keyframes]).reshape(-1, 7))
         xyz = keyframes.point_xyz[: keyframes.num_points]
         self.point_xyz = xyz[np.isfinite(xyz[:, 0])]
         self._points: dict[int, LocalPoints] = {}
@@ -67,16 +61,3 @@ class KnownScene:
         if row not in self._points:
             self._points[row] = local_points(self.keyframes, self._places, int(self.frame_idx[row]), num_neighbors)
         return self._points[row]
-
-    def expects(self, local: LocalPoints, pose: Array) -> NDArray[np.bool_]:
-        """(M,) which landmarks are seen from a pose (7,) from a side and a distance as before."""
-        before, now = self._centers[local.keyframe_idx] - local.xyz, rigid3.center(pose) - local.xyz
-        far, near = np.linalg.norm(before, axis=1), np.linalg.norm(now, axis=1)
-        aside = (before * now).sum(1) / np.maximum(far * near, 1e-300)
-        share = near / np.maximum(far, 1e-300)
-        is_seen: NDArray[np.bool_] = (
-            (aside > math.cos(math.radians(_MAX_ASIDE_DEG)))
-            & (share > _DISTANCE_SHARES[0])
-            & (share < _DISTANCE_SHARES[1])
-        )
-        return is_seen

@@ -3,8 +3,9 @@
 A false loop bends the whole map, so a loop has to be seen several times. The first keyframe finds it by what it looks
 like (:mod:`sfmapp.odometry.loops.relocalize`); the ones that follow must find themselves where the first says they are,
 with as many points and as little that contradicts; and one similarity, fitted to all of them and to their points as the
-old keyframes saw them, must explain them all. What it corrects must be something that the way between could have lost.
-The same search between two maps joins them.
+old keyframes saw them, must explain them all. What it corrects must be something that the way between could have lost,
+and what is seen there must be there alone (:mod:`sfmapp.odometry.loops.rivals`): a loop that only leads to what the
+map has elsewhere as well waits for a keyframe that sees something else. The same search between two maps joins them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.odometry.loops.place_recognition import Ids, PlaceIndex, View
+from sfmapp.odometry.loops.place_recognition import Candidate, Ids, PlaceIndex, View
 from sfmapp.odometry.loops.pose_graph import keyframe_depths
 from sfmapp.odometry.loops.relocalize import (
     LocalPoints,
@@ -32,6 +33,7 @@ from sfmapp.odometry.loops.relocalize import (
     shared_points,
     twist,
 )
+from sfmapp.odometry.loops.rivals import LoopEvidence, are_seen_apart
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 
 Array = NDArray[np.float64]
@@ -47,6 +49,7 @@ class LoopOptions:
     min_gap: int = 10  # keyframes just before one that are no loop
     min_shared: int = 15  # keyframes that share so many points are neighbours, no loop (ORB-SLAM)
     min_views: int = 3  # keyframes in which a loop must be seen
+    max_views: int = 12  # keyframes after which a loop that still may be a look-alike is given up
     min_agreement: float = 0.6  # least mean over the views of the share of points in view that agree
     max_misses: int = 1  # keyframes in between that may fail to see it
     max_drift: float = 0.15  # stereo: longest correction, share of the way between
@@ -101,12 +104,31 @@ class LoopClosure:
 
 @dataclass
 class _Suspicion:
-    """A loop that was seen, but not often enough yet."""
+    """A loop that was seen, but not often enough yet.
+
+    Attributes:
+        evidence: what landmarks say of it; None where it has been judged already.
+    """
 
     old_map: int
     old_from_new: Array
     views: list[LoopView] = field(default_factory=list)
     num_misses: int = 0
+    evidence: LoopEvidence | None = None
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Too much is missing where it leads."""
+        return self.evidence is not None and self.evidence.is_contradicted
+
+    def is_certain(self, shift: float | None) -> bool:
+        """It does not lead to the like of its place; see :meth:`LoopEvidence.is_certain`."""
+        return self.evidence is None or self.evidence.is_certain(shift)
+
+    def shift(self, keyframes: KeyframeMap) -> float:
+        """By how much it moves the newest keyframe that saw it."""
+        center = rigid3.center(keyframes.keyframes[self.views[-1].new_idx].rig_from_world)
+        return float(np.linalg.norm(similarity.apply(self.old_from_new, center) - center))
 
 
 class LoopFinder:
@@ -150,27 +172,40 @@ class LoopFinder:
             return self._confirm(maps, map_idx, places, new_idx, view)
         candidates = places.query(frame_idx, self._neighbors(keyframes, new_idx))
         candidates += places.query(frame_idx, other_maps=True)
+        found: list[_Suspicion] = []
         for candidate in candidates:
-            old_map = maps.get(candidate.map_idx)
-            if old_map is None or candidate.map_idx == barred:
-                continue
-            old_idx = position_of(old_map, candidate.frame_idx)
-            roll = 0.0
-            if old_map is keyframes:  # orientations drift slowly: the map knows how the image is turned
-                pair = np.array([keyframes.keyframes[k].rig_from_world for k in (new_idx, old_idx)])
-                roll = float(twist(*rigid3.rotation_matrix(pair)))
-            located = locate(old_map, places, view, candidate, self.options.relocalize, roll)
-            if located is None or not is_convincing(located, view, self.options.relocalize):
-                continue
-            seen = seen_in(old_map, places, view, (new_idx, old_idx), located, self.options.relocalize)
-            start = initial_similarity(keyframes, seen, self.options)
-            if start is None:
-                continue
-            suspicion = _Suspicion(candidate.map_idx, start, [seen])
-            if self._fits(maps, map_idx, suspicion):
-                self._suspicion = suspicion
-                break
+            if candidate.map_idx in maps and candidate.map_idx != barred:
+                suspicion = self._sight(maps, map_idx, places, new_idx, view, candidate)
+                found += [] if suspicion is None else [suspicion]
+        # of places that look alike the one where most is found and least is missing
+        self._suspicion = max(found, key=lambda s: s.evidence.weight if s.evidence else 0.0, default=None)
         return None
+
+    def _sight(
+        self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, new_idx: int, view: View,
+        candidate: Candidate,
+    ) -> _Suspicion | None:  # fmt: skip
+        """Look for a keyframe at a place that it looks like."""
+        options, keyframes, old_map = self.options, maps[map_idx], maps[candidate.map_idx]
+        old_idx = position_of(old_map, candidate.frame_idx)
+        roll = 0.0
+        if old_map is keyframes:  # orientations drift slowly: the map knows how the image is turned
+            pair = np.array([keyframes.keyframes[k].rig_from_world for k in (new_idx, old_idx)])
+            roll = float(twist(*rigid3.rotation_matrix(pair)))
+        located = locate(old_map, places, view, candidate, options.relocalize, roll)
+        if located is None or not is_convincing(located, view, options.relocalize):
+            return None
+        seen = seen_in(old_map, places, view, (new_idx, old_idx), located, options.relocalize)
+        start = initial_similarity(keyframes, seen, options)
+        if start is None:
+            return None
+        suspicion = _Suspicion(candidate.map_idx, start, [seen])
+        if not self._fits(maps, map_idx, suspicion):
+            return None
+        within = suspicion.old_from_new if old_map is keyframes else None
+        suspicion.evidence = LoopEvidence(old_map, places, within, options.relocalize)
+        suspicion.evidence.look(view, old_idx, located.cam_from_world)
+        return None if suspicion.is_contradicted else suspicion
 
     def _confirm(
         self, maps: Mapping[int, KeyframeMap], map_idx: int, places: PlaceIndex, new_idx: int, view: View
@@ -187,20 +222,31 @@ class LoopFinder:
             if old_idx is not None:
                 seen = self._seen_near(old_map, places, view, new_idx, old_idx, pose)
         if seen is not None:
-            trial = _Suspicion(suspicion.old_map, suspicion.old_from_new, [*suspicion.views, seen])
+            trial = _Suspicion(
+                suspicion.old_map, suspicion.old_from_new, [*suspicion.views, seen], evidence=suspicion.evidence
+            )
             if self._fits(maps, map_idx, trial):
-                self._suspicion = trial
-                if len(trial.views) < self.options.min_views:
-                    return None
-                if not np.mean([v.located.agreement for v in trial.views]) >= self.options.min_agreement:
-                    self._suspicion = None
-                    return None
-                self._suspicion = None
-                return self._closure(maps, map_idx, trial)
+                if trial.evidence is not None:
+                    trial.evidence.look(view, seen.old_idx, seen.located.cam_from_world)
+                return self._judge(maps, map_idx, trial)
         suspicion.num_misses += 1
         if suspicion.num_misses > self.options.max_misses:
             self._suspicion = None
         return None
+
+    def _judge(self, maps: Mapping[int, KeyframeMap], map_idx: int, trial: _Suspicion) -> LoopClosure | None:
+        """Believe a loop that another keyframe has seen, drop it, or wait for the next keyframe."""
+        options, num = self.options, len(trial.views)
+        self._suspicion = None if trial.is_contradicted else trial
+        if self._suspicion is None or num < options.min_views:
+            return None
+        agrees = bool(np.mean([v.located.agreement for v in trial.views]) >= options.min_agreement)
+        keyframes, newest = maps[map_idx], trial.views[-1].new_idx
+        shift = trial.shift(keyframes) / keyframe_depths(keyframes)[newest] if trial.old_map == map_idx else None
+        is_certain = agrees and trial.is_certain(shift)
+        if is_certain or not agrees or num >= options.max_views:
+            self._suspicion = None
+        return self._closure(maps, map_idx, trial) if is_certain else None
 
     def _seen_near(
         self, old_map: KeyframeMap, places: PlaceIndex, view: View, new_idx: int, old_idx: int, pose: Array
@@ -231,7 +277,12 @@ class LoopFinder:
         is_known = float((system.new_id == system.old_id).mean())
         if min(counts) < options.relocalize.min_inliers or is_known > 0.5:
             return False
-        return old_map is not keyframes or _could_have_drifted(keyframes, suspicion, options)
+        if old_map is not keyframes:
+            return True
+        # descriptors were looked for as far as four inlier thresholds away
+        return _could_have_drifted(keyframes, suspicion, options) and not are_seen_apart(
+            keyframes, system.new_id, system.old_id, 4.0 * limit
+        )
 
     def _closure(self, maps: Mapping[int, KeyframeMap], map_idx: int, suspicion: _Suspicion) -> LoopClosure:
         keyframes, old_map = maps[map_idx], maps[suspicion.old_map]
@@ -239,15 +290,11 @@ class LoopFinder:
         limit = self.options.relocalize.error_px(keyframes.rig.cameras[0])
         error = np.linalg.norm(system.forward(suspicion.old_from_new), axis=1)
         good = error < limit
-        newest = keyframes.keyframes[suspicion.views[-1].new_idx]
-        shift = similarity.apply(suspicion.old_from_new, rigid3.center(newest.rig_from_world)) - rigid3.center(
-            newest.rig_from_world
-        )
         return LoopClosure(
             map_idx, suspicion.old_map, suspicion.old_from_new, tuple(suspicion.views),
             _agreed_pairs(system.new_id[good], system.old_id[good]),
             tuple(system.count_inliers(suspicion.old_from_new, limit)), float(np.sqrt((error[good] ** 2).mean())),
-            float(np.linalg.norm(shift) / keyframe_depths(keyframes)[suspicion.views[-1].new_idx]),
+            float(suspicion.shift(keyframes) / keyframe_depths(keyframes)[suspicion.views[-1].new_idx]),
             float(rigid3.rotation_angle_deg(rigid3.rotation_matrix(suspicion.old_from_new))),
             float(suspicion.old_from_new[7]),
         )  # fmt: skip
@@ -306,7 +353,7 @@ def _could_have_drifted(keyframes: KeyframeMap, suspicion: _Suspicion, options: 
     way = float(np.linalg.norm(np.diff(centers[view.old_idx : view.new_idx + 1], axis=0), axis=1).sum())
     share = options.max_drift if keyframes.rig.is_stereo else options.max_drift_mono
     free = 0.5 * float(keyframe_depths(keyframes)[view.new_idx])
-    shift = np.linalg.norm(similarity.apply(suspicion.old_from_new, centers[view.new_idx]) - centers[view.new_idx])
+    shift = suspicion.shift(keyframes)
     angle = rigid3.rotation_angle_deg(rigid3.rotation_matrix(suspicion.old_from_new))
     return bool(shift <= share * way + free and angle <= options.max_rotation_deg)
 

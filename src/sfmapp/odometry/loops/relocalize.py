@@ -39,6 +39,9 @@ _SAME_PATCH_SIGMAS = 8.0
 # Two poses of one image are two places beyond this: shares of the depth of what it sees, and degrees. An image that is
 # right in both agrees to a hundredth of that.
 _ELSEWHERE_DEPTHS, _ELSEWHERE_DEG = 0.1, 5.0
+# Landmarks are expected where they are seen from a side as before: within this angle, at a distance between these
+# shares of that (what descriptors bear).
+_MAX_ASIDE_DEG, _DISTANCE_SHARES = 35.0, (0.6, 1.6)
 
 
 @dataclass(frozen=True)
@@ -337,6 +340,20 @@ def agreeing_at(local: LocalPoints, view: View, camera: Camera, pose: Array) -> 
     apart = np.linalg.norm(place[:, None] - place[None], axis=2) > _SAME_PATCH_SIGMAS * SIGMA_PX
     rank = ((products >= own[:, None]) & apart).sum(1) / np.maximum(apart.sum(1), 1)
     return shown.point_id, rank < _CHANCE_RANK
+
+
+def seen_as_before(keyframes: KeyframeMap, local: LocalPoints, pose: Array) -> Mask:
+    """(M,) which points are seen from a pose (7,) from a side and a distance as from their keyframes."""
+    owner, row = np.unique(local.keyframe_idx, return_inverse=True)
+    centers = rigid3.center(np.array([keyframes.keyframes[k].rig_from_world for k in owner]).reshape(-1, 7))
+    before, now = centers[row] - local.xyz, rigid3.center(pose) - local.xyz
+    far, near = np.linalg.norm(before, axis=1), np.linalg.norm(now, axis=1)
+    aside = (before * now).sum(1) / np.maximum(far * near, 1e-300)
+    share = near / np.maximum(far, 1e-300)
+    is_seen: Mask = (
+        (aside > math.cos(math.radians(_MAX_ASIDE_DEG))) & (share > _DISTANCE_SHARES[0]) & (share < _DISTANCE_SHARES[1])
+    )
+    return is_seen
 
 
 def twist(rotation: Array, other: Array) -> Array:

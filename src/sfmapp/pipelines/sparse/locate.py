@@ -25,9 +25,8 @@ from sfmapp.images.pixels import read_gray
 from sfmapp.images.report import CameraPrior
 from sfmapp.mapping.attach import NewPhotograph
 from sfmapp.mapping.locate import STAGE, Located, LocateOptions, find_candidates, locate_photograph
-from sfmapp.odometry.belief.belief import MAX_DOUBT
-from sfmapp.odometry.belief.evidence import Score
 from sfmapp.odometry.belief.photographs import CHANGED_AMONG_LIKES, judge_place
+from sfmapp.odometry.loops.evidence import MAX_DOUBT, Score
 from sfmapp.pipelines.metres import metre_sigma_of_run
 from sfmapp.pipelines.sparse.finished import Finished, open_database, read_finished
 from sfmapp.report.located_html import LandmarksReport, LocatedPhotographReport, LocatedReport, render_located_html

@@ -1,4 +1,4 @@
-"""What of a known map looks alike: where else in it a keyframe could have been taken, and which things it holds twice.
+"""What of a map looks alike: where else in it a keyframe could have been taken, and which things it holds twice.
 
 A frame tells which places it looks like only as far as recognition finds them, and of two equal places one may fall
 just short. The map itself tells it once more.
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.loops.place_recognition import Bytes, Ids, PlaceIndex, View
 from sfmapp.odometry.loops.pose_graph import keyframe_depths
 from sfmapp.odometry.loops.relocalize import (
@@ -45,24 +45,29 @@ class LookAlikes:
     """The doubles of a map, found where they are asked for.
 
     Args:
-        places: the keyframes as they are remembered. pictures: of keyframes, (H, W) uint8 by position.
+        places: the keyframes as they are remembered. pictures: of keyframes, (H, W) uint8 by position, for
+            :meth:`around`.
+        same: (8,) similarity that takes a place of the map to another one which may be the same: what it takes onto its
+            like is there once. None: no places are the same.
 
     Attributes:
         cluster: (P,) which cluster a landmark belongs to, neighbours in a cube; -1 for what is no place's landmark.
     """
 
-    def __init__(self, keyframes: KeyframeMap, places: PlaceIndex, pictures: Mapping[int, Bytes]) -> None:
+    def __init__(
+        self, keyframes: KeyframeMap, places: PlaceIndex, pictures: Mapping[int, Bytes], same: Array | None = None
+    ) -> None:
         self._keyframes, self._places, self._pictures = keyframes, places, pictures
-        described: dict[int, Bytes] = {}
-        for keyframe in keyframes.keyframes:
-            if keyframe.frame_idx in places:
-                place = places[keyframe.frame_idx]
-                for point, row in zip(place.point_id.tolist(), place.descriptors, strict=True):
-                    described.setdefault(point, row)
-        self._ids: Ids = np.array(sorted(described), np.int64)
-        self._ids = self._ids[keyframes.is_triangulated(self._ids)]
-        self._descriptors = np.array([described[k] for k in self._ids.tolist()], np.float32).reshape(-1, 128)
+        seen = [places[k.frame_idx] for k in keyframes.keyframes if k.frame_idx in places]
+        ids = np.concatenate([np.zeros(0, np.int64), *[place.point_id for place in seen]])
+        # each as it looked first
+        self._ids, first = np.unique(ids, return_index=True)
+        known = keyframes.is_triangulated(self._ids)
+        self._ids, first = self._ids[known], first[known]
+        described = np.concatenate([np.zeros((0, 128), np.uint8), *[place.descriptors for place in seen]])
+        self._descriptors = described[first].astype(np.float32)
         self._xyz = keyframes.point_xyz[self._ids]
+        self._as_same = None if same is None else similarity.apply(same, self._xyz)
         depths = keyframe_depths(keyframes)
         self._edge = _CLUSTER_DEPTHS * (float(np.median(depths)) if len(depths) else 1.0)
         self.cluster: Ids = np.full(keyframes.num_points, -1, np.int64)
@@ -91,6 +96,9 @@ class LookAlikes:
             products = self._descriptors[mine[block : block + _BLOCK]] @ self._descriptors.T
             first, twin = np.nonzero(products > least)
             apart = ((self._xyz[mine[block + first]] - self._xyz[twin]) ** 2).sum(1) > (2.0 * self._edge) ** 2
+            if self._as_same is not None:
+                off = self._xyz[mine[block + first]] - self._as_same[twin]
+                apart &= (off**2).sum(1) > (2.0 * self._edge) ** 2
             first, twin = first[apart], twin[apart]
             order = np.lexsort((-products[first, twin], first))
             first, twin = first[order], twin[order]

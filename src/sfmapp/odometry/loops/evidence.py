@@ -25,9 +25,14 @@ Mask = NDArray[np.bool_]
 _THERE, _NOT_THERE = (3.0, 1.0), (1.0, 19.0)
 # Share of clusters of a right place that are hidden or have changed (1 to 2 % were in a rendered hall in which nothing
 # changes), and of those of a wrong one that look alike.
-_CHANGED, _COMMON = 0.05, 0.05
+CHANGED, _COMMON = 0.05, 0.05
 # Probability of as many missing clusters by chance that contradicts a place.
 _CHANCE = 0.01
+# All that speaks against a place that is believed: of a thousand cameras that believe to know where they are, one does
+# not, as far as the likelihoods are right.
+MAX_DOUBT = 1e-3
+# Probability, beforehand, that the camera is at no place of a map; its places share the rest.
+NOT_IN_MAP = 0.5
 # Fewest landmarks of a cluster that speaks.
 _MIN_LANDMARKS = 3
 
@@ -39,7 +44,7 @@ class Score:
     Attributes:
         support: of all clusters. distinct: of those that are found and have no like elsewhere in the map.
         against: of those that are missing, at most 0.
-        num_clusters: that speak. num_missing: that speak against it.
+        num_clusters: that speak. num_missing: that speak against it. num_distinct: that are found and have no like.
     """
 
     support: float = 0.0
@@ -47,6 +52,7 @@ class Score:
     against: float = 0.0
     num_clusters: int = 0
     num_missing: int = 0
+    num_distinct: int = 0
 
     @property
     def total(self) -> float:
@@ -55,15 +61,12 @@ class Score:
 
     @property
     def is_contradicted(self) -> bool:
-        """More is missing than what is hidden or has changed in a right place: as much by chance once in a hundred
-        places."""
-        return self.is_contradicted_beyond(_CHANGED)
+        """More is missing than what is hidden or has changed in a right place."""
+        return self.is_contradicted_beyond(CHANGED)
 
     def is_contradicted_beyond(self, share: float) -> bool:
         """The same where another share of the clusters of a right place is hidden or has changed."""
-        n, m = self.num_clusters, self.num_missing
-        fewer = sum(math.comb(n, k) * share**k * (1 - share) ** (n - k) for k in range(m))
-        return 1.0 - fewer < _CHANCE
+        return is_contradicted(self.num_clusters, self.num_missing, share)
 
 
 @dataclass
@@ -113,8 +116,34 @@ class Tally:
         is_distinct = ~np.isin(ids[speaks], repeated)
         return Score(
             float(ratio.sum()), float(ratio[is_distinct & (ratio > 0)].sum()), float(ratio[ratio < 0].sum()),
-            int(speaks.sum()), int((ratio < 0).sum()),
+            int(speaks.sum()), int((ratio < 0).sum()), int((is_distinct & (ratio > 0)).sum()),
         )  # fmt: skip
+
+
+def is_contradicted(num: int, num_against: int, share: float = CHANGED) -> bool:
+    """Whether more of what was asked speaks against a place than the share that is hidden or has changed in a right
+    one: as much by chance once in a hundred places."""
+    logs = (
+        math.lgamma(num + 1) - math.lgamma(k + 1) - math.lgamma(num - k + 1)
+        + k * math.log(share) + (num - k) * math.log(1 - share)
+        for k in range(num_against)
+    )  # fmt: skip
+    return 1.0 - sum(math.exp(log) for log in logs) < _CHANCE
+
+
+def log_ratio_of_share(num: int, total: int, expected: float) -> float:
+    """Logarithm of how much likelier it is that ``num`` of ``total`` independent draws are of a kind if its share is as
+    found than if it is as expected; 0 where it is no larger."""
+    if num <= expected * total:
+        return 0.0
+    share = num / total
+    rest = (total - num) * math.log((1.0 - share) / (1.0 - expected)) if num < total else 0.0
+    return num * math.log(share / expected) + rest
+
+
+def log_prior(num_places: int) -> float:
+    """Logarithm of the probability of one place of a map beforehand."""
+    return math.log((1.0 - NOT_IN_MAP) / max(num_places, 1))
 
 
 def log_ratio(num: int, found: float) -> float:
@@ -123,7 +152,7 @@ def log_ratio(num: int, found: float) -> float:
     there, not_there = _log_beta_binomial(num, found, _THERE), _log_beta_binomial(num, found, _NOT_THERE)
     most = max(there, not_there)
     a, b = math.exp(there - most), math.exp(not_there - most)
-    return math.log((1 - _CHANGED) * a + _CHANGED * b) - math.log((1 - _COMMON) * b + _COMMON * a)
+    return math.log((1 - CHANGED) * a + CHANGED * b) - math.log((1 - _COMMON) * b + _COMMON * a)
 
 
 def _log_beta_binomial(num: int, found: float, beta: tuple[float, float]) -> float:
