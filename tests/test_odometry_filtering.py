@@ -28,6 +28,8 @@ from sfmapp.odometry.residual_memory import Correlation, ResidualMemory
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot
 from sfmapp.pipelines.odometry.filtering import COLUMNS, LiveFilter, SharedErrors, filtered_csv
+from sfmapp.report.model import FramesReport
+from sfmapp.report.odometry_document import FrameTable, make_checks
 from test_odometry_smoothing import perturbed, tangent
 
 RATE_HZ, FPS, DURATION_S = 100.0, 20.0, 12.0
@@ -175,14 +177,27 @@ def test_silence_of_the_sensor_and_long_gaps_begin_anew() -> None:
         filter_trajectory(np.zeros(len(poses)), poses, case.covariance, case.sensor)
 
 
-def test_a_sensor_noisier_than_stated_shows_in_the_innovations() -> None:
+def noisier_sensor(case: Case) -> Imu:
+    """Thirty times as noisy as it says."""
+    noisy, said = case.flight.imu(3, DURATION_S, noise=30.0, rate_hz=RATE_HZ), case.sensor.imu
+    return replace(
+        noisy, gyro_noise=said.gyro_noise, accel_noise=said.accel_noise, gyro_walk=said.gyro_walk,
+        accel_walk=said.accel_walk,
+    )  # fmt: skip
+
+
+def test_a_sensor_noisier_than_stated_shows_in_the_innovations_and_widens_sigmas() -> None:
     case = CASES[3]
-    noisy = case.flight.imu(3, DURATION_S, noise=30.0, rate_hz=RATE_HZ)
-    told = consistency(case.filtered(replace(case.sensor, imu=replace(
-        noisy, gyro_noise=case.sensor.imu.gyro_noise, accel_noise=case.sensor.imu.accel_noise,
-        gyro_walk=case.sensor.imu.gyro_walk, accel_walk=case.sensor.imu.accel_walk))).nis)  # fmt: skip
+    found, good = case.filtered(replace(case.sensor, imu=noisier_sensor(case))), case.filtered(case.sensor)
+    told = consistency(found.nis)
     assert told is not None
     assert told.mean > told.mean_high
+    # by what innovations of the last two seconds are beyond what they should be, and no sooner than that is certain
+    assert (found.widening[: found.frame_row[19]] == 1.0).all()
+    wide = found.widening > 1.0
+    assert wide.mean() > 0.5
+    assert np.median(found.widening[wide]) == pytest.approx(told.mean, rel=0.5)
+    assert (good.widening == 1.0).mean() > 0.95
 
 
 # ---- without a sensor
@@ -393,6 +408,7 @@ def test_a_run_finds_gravity_scale_and_clock_by_itself(unit_m: float | None) -> 
         assert report.white_share == 1.0
         assert report.consistency is not None
         assert 0.8 < report.consistency.mean < report.consistency.mean_high + 0.1
+        assert not report.contradictions
         ways = [np.linalg.norm(np.diff(rigid3.center(poses), axis=0), axis=1).sum() for poses in (
             found.cam_from_world[found.frame_row[-100:]], case.truth[-100:])]  # fmt: skip
         assert ways[0] == pytest.approx(ways[1], rel=0.02)
@@ -418,6 +434,23 @@ def test_what_a_run_begins_with_is_as_sure_as_it_says() -> None:
     # the three err together, and are at most as far off as independent ones
     low, high = chi2.ppf([0.025, 0.975], 6 * len(total)) / (6 * len(total))
     assert low < total.mean() / 6 < high
+
+
+def test_sigmas_that_had_to_be_widened_are_a_contradiction() -> None:
+    case = CASES[3]
+    _, report = lived(case, noisier_sensor(case))
+    assert [row.subject for row in report.contradictions] == ["filtered live poses"]
+    told = report.contradictions[0]
+    assert "from where the IMU expects them" in told.message
+    assert told.evidence["share_widened"] > 0.5
+    # red in the report, in which its numbers are
+    frames = FramesReport(
+        num_frames=9, num_unreadable=0, num_with_pose=9, num_in_largest_map=9, waiting=0, tracked=9, relocalized=0,
+        lost=0, repeated=0, gaps=[],
+    )  # fmt: skip
+    facts = FrameTable(np.full(1, np.nan), np.full(1, np.nan), np.full(1, np.nan), np.full(1, -1))
+    lights = {row.name: row.light for row in make_checks(frames, [], None, facts, filtered=report)}
+    assert lights["contradiction: filtered live poses"] == "red"
 
 
 def test_a_sensor_that_tells_nothing_does_not_predict() -> None:

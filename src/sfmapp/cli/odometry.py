@@ -256,6 +256,8 @@ def _print_summary(args: argparse.Namespace, report: OdometryRunReport) -> None:
     if report.live is not None:
         print(f"  {live_text(report.live)}")
     print_contradictions(row for found in report.maps for row in found.contradictions)
+    if report.stages.filter is not None:
+        print_contradictions(report.stages.filter.contradictions)
     pace = ""
     if timing is not None:
         pace = f"; {timing.cpu_ms_per_frame:.1f} CPU ms a frame, {timing.frames_per_second:.1f} frames a second"

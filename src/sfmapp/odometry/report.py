@@ -220,6 +220,7 @@ class FilterReport(Report):
             the frame left out.
         white_share, walk_share: of the variance of a pose, in the middle: what is new in each frame and gone in the
             next, and what is added from frame to frame and stays with the map.
+        contradictions: innovations that were larger than sigmas say, for longer than chance would have it.
     """
 
     prediction: str
@@ -235,6 +236,7 @@ class FilterReport(Report):
     walk_share: float
     reason: str | None = None
     consistency: FilterConsistency | None = None
+    contradictions: Sequence[Contradiction] = ()
 
 
 class SharedErrors(Report):

@@ -21,7 +21,7 @@ from sfmapp.evaluation.trajectory import (
 )
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import GroundTruth
-from sfmapp.odometry.report import KnownMapReport
+from sfmapp.odometry.report import FilterReport, KnownMapReport
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
 from sfmapp.report.document import check, check_contradictions
 from sfmapp.report.model import (
@@ -234,6 +234,7 @@ def make_checks(
     pace: TimingReport | LiveReport | None,
     facts: FrameTable,
     known_map: KnownMapReport | None = None,
+    filtered: FilterReport | None = None,
 ) -> list[Check]:
     """Traffic lights over a run, each with its thresholds in words; ``pace``: against the rate of the camera, or of a
     live source."""
@@ -263,7 +264,8 @@ def make_checks(
             rows.append(Check(name=name, value=found.covariance_gap, light=light, thresholds=thresholds))
     if known_map is not None:
         rows.append(_known_map_check(known_map))
-    return rows + check_contradictions(each for found in maps for each in found.contradictions)
+    contradictions = [each for found in maps for each in found.contradictions]
+    return rows + check_contradictions([*contradictions, *(() if filtered is None else filtered.contradictions)])
 
 
 def _known_map_check(row: KnownMapReport) -> Check:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import GroundTruth
-from sfmapp.odometry.report import BeliefReport, KnownMapReport
+from sfmapp.odometry.report import BeliefReport, FilterReport, KnownMapReport
 from sfmapp.odometry.result import OdometryResult
 from sfmapp.report.model import (
     Gap,
@@ -52,7 +52,12 @@ def render_odometry_html(
         body.append(_known_map(report.stages.odometry.known_map))
     body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
     body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps))
-    body.append(_live(report.live) + _timing(report.timing) + usage_table(report.usage, report.run))
+    body.append(
+        _live(report.live)
+        + _filter(report.stages.filter)
+        + _timing(report.timing)
+        + usage_table(report.usage, report.run)
+    )
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp odometry: {report.run.source}", body)
 
@@ -316,6 +321,31 @@ def _live(live: LiveReport | None) -> str:
         f"At most {live.max_waiting} frames wait. The longest time without a frame was {live.longest_silence_s:.2f} s."
     )
     return f"<h2>Live</h2><p>{escape(live_text(live))}.</p><p class=dim>{note}</p>"
+
+
+def _filter(found: FilterReport | None) -> str:
+    """What the filter made of live poses, what it did not believe, and over what it went by motion alone."""
+    if found is None:
+        return ""
+    text = (
+        f"{found.num_poses} poses at {found.rate_hz:.4g} Hz, predicted by "
+        f"{found.prediction.replace('imu', 'the IMU')}; {found.num_used} measured poses corrected them. "
+        + ("" if found.reason is None else f"Not by the IMU: {found.reason}. ")
+    )
+    if told := found.consistency:
+        text += (
+            f"Measured poses were {told.mean:.2f} of the expected squares from where they were expected "
+            f"({told.mean_low:.2f} to {told.mean_high:.2f} in 95 % of runs where all is as modelled)."
+        )
+    rows = [
+        [("", f"{gap.first_s:.2f}"), ("", f"{gap.last_s:.2f}"), ("", f"{gap.position_sigma:.3g}"),
+         ("", f"{gap.rotation_sigma_deg:.2f}")] for gap in found.gaps[:MAX_GAPS]
+    ]  # fmt: skip
+    head = [("", "last pose, s"), ("", "until, s"), ("", "position sigma"), ("", "rotation sigma, deg")]
+    body = f"<h2>Filtered live poses</h2><p>{escape(text)}</p>"
+    for row in found.rejected[:MAX_GAPS]:
+        body += f"<p class=dim>{escape(row.name)} left out: {escape(row.reason)}</p>"
+    return body + (table(head, rows) if rows else "")
 
 
 def _timing(timing: TimingReport | None) -> str:

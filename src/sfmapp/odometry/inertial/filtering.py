@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -38,6 +39,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+# Innovations of so many frames are held against what they should be, of no fewer than so many; what one in a thousand
+# of good ones goes beyond is too much: the quantile of a normal distribution.
+_WINDOW, _LEAST_WINDOW, _QUANTILE = 40, 20, 3.09
 # Frames further apart than so many times their usual distance have lost some between them.
 _DROPPED = 1.5
 LIVE = SmoothingOptions(max_gap_s=5.0, is_causal=True)
@@ -61,6 +65,8 @@ class FilteredTrajectory:
         prediction: ``imu`` or ``constant velocity``.
         gyro_bias, accel_bias: (3,) in the end; zeros without a sensor.
         latency_s: (N,) seconds on the clock that finding a row took, after its sample or pose was there.
+        widening: (N,) factor that is in the covariance, as innovations of the last frames were larger than they should
+            be; 1 where they were not.
     """
 
     timestamps_s: Array
@@ -75,6 +81,7 @@ class FilteredTrajectory:
     gyro_bias: Array
     accel_bias: Array
     latency_s: Array
+    widening: Array
 
     @property
     def position_sigma(self) -> Array:
@@ -158,7 +165,7 @@ def _at_constant_velocity(
     return FilteredTrajectory(
         times[rows], found.cam_from_world[rows], found.covariance[rows], since, found.is_predicted[rows], frame_row,
         found.nis, found.is_rejected, "constant velocity", np.zeros(3), np.zeros(3),
-        np.full(len(rows), spent / max(len(rows), 1)),
+        np.full(len(rows), spent / max(len(rows), 1)), np.ones(len(rows)),
     )  # fmt: skip
 
 
@@ -172,6 +179,7 @@ class _Row(NamedTuple):
     since_pose_s: float
     is_bridged: bool
     latency_s: float
+    widening: float
 
 
 class _Sample(NamedTuple):
@@ -201,7 +209,7 @@ class InertialFilter:
         self._anchor_s = self._head_s = self._used_s = -math.inf
         self._samples: list[_Sample] = []  # from the last one before the anchor on
         self._in_a_row, self._is_waiting, self._interval_s = 0, False, math.inf
-        self._rows = list[_Row]()
+        self._rows, self._recent = list[_Row](), deque[float](maxlen=_WINDOW)
         self._nis, self._is_rejected, self._frame_s = list[float](), list[bool](), list[float]()
 
     def add_sample(self, timestamp_s: float, gyro: Array, accel: Array) -> None:
@@ -291,6 +299,7 @@ class InertialFilter:
             np.array([at.get(frame_s, -1) for frame_s in self._frame_s], np.int64), np.array(self._nis),
             np.array(self._is_rejected, bool), "imu",
             state.gyro_bias, state.accel_bias, np.array([row.latency_s for row in rows]),
+            np.array([row.widening for row in rows]),
         )  # fmt: skip
 
     def _begin_at(self, timestamp_s: float, pose: tuple[Array, Array, Array], shared: Shared, begin: float) -> None:
@@ -353,6 +362,7 @@ class InertialFilter:
         noise = shared.white * noise
         innovation = state.innovation(center, rotation)
         self._nis[-1] = state.nis(innovation, noise)
+        self._recent.append(min(self._nis[-1], self._options.max_nis))
         if self._nis[-1] > self._options.max_nis:
             self._in_a_row += 1
             if self._in_a_row <= self._options.max_rejected:
@@ -363,7 +373,18 @@ class InertialFilter:
         state.correct(innovation, noise)
         return True
 
+    def _widening(self) -> float:
+        """By how much the innovations of the last frames are larger than expected, as a factor of variances; 1 where
+        that may be chance. The quantile of chi-squared is that of Wilson and Hilferty, PNAS 1931."""
+        num = len(self._recent)
+        if num < _LEAST_WINDOW:
+            return 1.0
+        small = 2.0 / (9.0 * 6.0 * num)
+        mean = sum(self._recent) / (6.0 * num)
+        return mean if mean > (1.0 - small + _QUANTILE * math.sqrt(small)) ** 3 else 1.0
+
     def _note(self, state: FilterState, now: float, is_bridged: bool, begin: float) -> None:
         rotation, center, covariance = state.camera()
         spent = time.perf_counter() - begin
-        self._rows.append(_Row(now, rotation, center, covariance, now - self._used_s, is_bridged, spent))
+        wider = self._widening()
+        self._rows.append(_Row(now, rotation, center, wider * covariance, now - self._used_s, is_bridged, spent, wider))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.contradictions import Contradiction
 from sfmapp.events import Event, Events
 from sfmapp.geometry import similarity
 from sfmapp.images.sequence import Imu
@@ -49,6 +50,10 @@ _LEAST_WHITE = 0.02
 _OWN = 0.5
 # Of a velocity of which nothing is known, m/s: whatever carries a camera.
 _UNKNOWN_SPEED = 10.0
+
+
+# Sigmas that had to be widened for a while are told by their size; for longer they are a contradiction.
+_MAX_WIDENED = 0.1
 
 
 class SharedErrors:
@@ -259,8 +264,24 @@ def _report(
         num_used=int((found.since_pose_s[rows] == 0.0).sum()), rejected=rejected, gaps=list(_gaps(found)),
         latency_ms_median=float(np.median(latency)), latency_ms_p95=float(np.percentile(latency, 95)),
         latency_ms_max=float(latency.max()), white_share=white, walk_share=walk, reason=reason,
-        consistency=consistency(found.nis),
+        consistency=consistency(found.nis), contradictions=_contradictions(found),
     )  # fmt: skip
+
+
+def _contradictions(found: FilteredTrajectory) -> list[Contradiction]:
+    """What the motion says against the stated sigmas: none where no more than a tenth of them had to be widened."""
+    wide = np.flatnonzero(found.widening > 1.0)
+    share = len(wide) / max(1, len(found.widening))
+    if share <= _MAX_WIDENED:
+        return []
+    factor = float(found.widening.max())
+    return [Contradiction(
+        "filtered live poses",
+        f"poses are {math.sqrt(factor):.1f} times as far as their sigmas say from where the IMU expects them, first at "
+        f"{found.timestamps_s[wide[0]]:.2f} s; sigmas of {share:.0%} of the filtered poses are wider for it",
+        "check the noise densities of the IMU, its mounting and its clock; the live poses may be wrong as well",
+        {"variance_factor": factor, "share_widened": share, "max_share": _MAX_WIDENED},
+    )]  # fmt: skip
 
 
 def _gaps(found: FilteredTrajectory) -> Iterator[FilterGap]:

@@ -258,7 +258,7 @@ def make_report(
         ground_truth=_ground_truth_rows(run, result, facts, against),
         timing=timing,
         live=live,
-        checks=make_checks(frames, maps, live or timing, facts, known_map) if maps else [],
+        checks=make_checks(frames, maps, live or timing, facts, known_map, run.stages.filter) if maps else [],
         usage=run.usage,
         warnings=run.log.warnings,
         decisions=run.log.decisions,
