@@ -201,3 +201,20 @@ def test_many_large_spills_are_warned_of() -> None:
         ]  # fmt: skip
         told_of_repairs(entries, True, events)
         assert any("masks are bad" in line for line in lines) == is_told
+
+
+def test_a_camera_amid_the_object_is_named_though_its_picture_cuts_the_object_off() -> None:
+    masks = list(MASKS["lumps"])
+    views = list(VIEWS)
+    camera, pose = views[TURNED].camera, views[TURNED].cam_from_world
+    assert camera is not None
+    assert pose is not None
+    places = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3))
+    deepest = places[SOLIDS["lumps"](places).argmin()]
+    moved = np.concatenate([pose[:4], -rigid3.rotation_matrix(pose) @ deepest])
+    views[TURNED] = view_of_camera(views[TURNED].name, camera, moved)
+    # what goes on beyond the picture may be anywhere there
+    masks[TURNED] = masks[TURNED] | (np.arange(120) > 60)
+    found = verdicts(views, masks)
+    assert [i for i, verdict in enumerate(found) if verdict.problem] == [TURNED]
+    assert "where all others" in found[TURNED].problem

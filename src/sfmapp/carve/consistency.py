@@ -141,6 +141,12 @@ def compare(
     contradicted, agree = find_contradicted(tangents, used, most)
     for each in contradicted:
         verdicts[each.view] = _against(silhouettes[each.view], each)
+    amid = [i for i in _amid(views, silhouettes, used) if not verdicts[i].problem]
+    if len(contradicted) + len(amid) <= most:
+        for i in amid:
+            verdicts[i] = Verdict(
+                _unknown(silhouettes[i]), "has its camera where all others that look there show the object"
+            )
     _judge_by_volume(views, silhouettes, used, verdicts, most, repairs=repairs, workers=workers, events=events)
     kept = [i for i in used if not verdicts[i].problem]
     if not agree and not are_in_agreement(Tangents(views, [verdict.silhouette for verdict in verdicts]), kept):
@@ -188,6 +194,24 @@ def _judge_by_volume(
         verdicts[i] = _repaired(silhouettes[i], found, *holes.doubtful_ones(k), repairs)
     for i, verdict in out.items():
         verdicts[i] = verdict
+
+
+def _amid(views: Sequence[View], silhouettes: Sequence[Silhouette], used: Sequence[int]) -> list[int]:
+    """Views whose cameras stand inside all other silhouettes that show their places: outlines of what goes on beyond a
+    picture cannot refute them, but an object is not carved from within."""
+    centers = np.array([views[i].center for i in used])
+    inside = np.full((len(used), len(used)), np.nan)
+    for k, at in enumerate(used):
+        seen = np.empty((len(used), 3))
+        project_points(views[at].row, centers, seen)
+        height, width = silhouettes[at].distance.shape
+        x, y, depth = seen.T
+        shown = np.flatnonzero((depth > 0.0) & (x >= 0.0) & (x < width) & (y >= 0.0) & (y < height))
+        inside[shown, k] = silhouettes[at].distance[y[shown].astype(int), x[shown].astype(int)]
+    np.fill_diagonal(inside, np.nan)
+    told = ~np.isnan(inside)
+    is_amid = (told.sum(axis=1) >= FEWEST - 1) & ~(told & (inside <= _MARGIN_PX)).any(axis=1)
+    return [i for i, inside_all in zip(used, is_amid.tolist(), strict=True) if inside_all]
 
 
 def _against(silhouette: Silhouette, found: Contradicted) -> Verdict:
