@@ -126,17 +126,24 @@ def _fill_rows(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: Pa
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64], out: Packed) -> None:
+def _fill_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64], words: NDArray[np.uint32]) -> None:
+    """Fill words (G, 128 / PER_SUM, LANES), the numbers that one sum takes up at a time; zeros less OFFSET at the end.
+
+    Less 128 a byte has its highest bit turned.
+    """
+    nothing = np.uint32(0)
+    for part in range(PER_SUM):
+        nothing |= np.uint32(OFFSET) << np.uint32(32 // PER_SUM * part)
     for i in range(len(order)):
-        source, target, lane = descriptors[order[i]], out[i // LANES], i % LANES
+        source, target, lane = descriptors[order[i]], words[i // LANES], i % LANES
         for k in range(DIMS // PER_SUM):
+            word = np.uint32(0)
             for part in range(PER_SUM):
-                target[k, lane, part] = np.int32(source[PER_SUM * k + part]) - OFFSET
-    for i in range(len(order), out.shape[0] * LANES):
-        target, lane = out[i // LANES], i % LANES
+                word |= np.uint32(source[PER_SUM * k + part]) << np.uint32(32 // PER_SUM * part)
+            target[k, lane] = word ^ nothing
+    for i in range(len(order), words.shape[0] * LANES):
         for k in range(DIMS // PER_SUM):
-            for part in range(PER_SUM):
-                target[k, lane, part] = -OFFSET
+            words[i // LANES, k, i % LANES] = nothing
 
 
 class _Buffers(threading.local):
@@ -173,7 +180,7 @@ def pack_groups(descriptors: NDArray[np.uint8], order: NDArray[np.int64]) -> Pac
     if len(_BUFFERS.groups) < size:
         _BUFFERS.groups = np.empty(size, GROUP_TYPE)
     out = _BUFFERS.groups[:size].reshape(num_groups, DIMS // PER_SUM, LANES, PER_SUM)
-    _fill_groups(np.ascontiguousarray(descriptors), order, out)
+    _fill_groups(np.ascontiguousarray(descriptors), order, out.view(np.uint32)[..., 0])
     return out
 
 
