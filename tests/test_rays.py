@@ -76,7 +76,7 @@ def test_depths_along_rays_are_distances_and_negative_behind() -> None:
 def test_five_rays_allow_the_true_essential_matrix(seed: int) -> None:
     _, pose, xyz, seen = all_round(seed, 5)
     true = epipolar.essential_from_pose(pose)
-    found = five_point.essentials_of_five(unit(xyz), unit(seen))
+    found = five_point.essentials_of_samples(unit(xyz), unit(seen), np.arange(5)[None])
     assert min(min(np.abs(e - true).max(), np.abs(e + true).max()) for e in found) < 1e-7
     for e in found:  # each of them is an essential matrix that the five agree with
         assert epipolar.sampson_errors(e, unit(xyz), unit(seen)).max() < 1e-15
@@ -90,7 +90,7 @@ def test_in_front_the_solutions_are_those_of_opencv(seed: int) -> None:
     seen = rigid3.apply(np.concatenate([rigid3.quaternion(rigid3.exp_so3([0.1, 0.2, 0.0])), [1.0, 0.2, 0.1]]), xyz)
     flat = [points[:, :2] / points[:, 2:] for points in (xyz, seen)]
     theirs = cv2.findEssentialMat(*flat, np.eye(3), cv2.RANSAC, 0.999, 1e-9)[0].reshape(-1, 3, 3)
-    ours = five_point.essentials_of_five(unit(xyz), unit(seen))
+    ours = five_point.essentials_of_samples(unit(xyz), unit(seen), np.arange(5)[None])
     for e in theirs:
         e = e / np.linalg.norm(e)
         assert min(min(np.abs(e - other).max(), np.abs(e + other).max()) for other in ours) < 1e-6

@@ -92,11 +92,11 @@ def assemble(
     camera_block, second_block = lenses.block, lenses.second
     num_blocks = block_dim.shape[0]
     for k in range(1, own.shape[0]):
-        own[0] += own[k]
-        cross[0] += cross[k]
-        gradient[0] += gradient[k]
-    own[0] += extra[0]
-    gradient[0, : num_blocks * 8] += extra[1]
+        _add_into(own[0], own[k])
+        _add_into(cross[0], cross[k])
+        _add_into(gradient[0], gradient[k])
+    _add_into(own[0], extra[0])
+    _add_into(gradient[0], extra[1])
     for a in range(num_blocks):
         tile = find_tile(tile_rows, a, a)
         for n in range(64):
@@ -116,6 +116,13 @@ def assemble(
     for c in range(camera_block.shape[0]):
         if second_block[c] >= 0:
             _add_tile(tiles, cross, 2 * num_images + c, find_tile(tile_rows, camera_block[c], second_block[c]))
+
+
+# not by ``+=``, which brings code that broadcasts, and that writes the message of its failure
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_into(out: Array, values: Array) -> None:
+    for n in range(values.shape[0]):
+        out[n] += values[n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -125,37 +125,28 @@ def _differences(levels: tuple[Pointer, ...], at: int, rows: Pointer, middle: in
 
 
 @numba.njit(cache=True, nogil=True)
-def _largest_around(rows: Pointer, difference: int, c: int) -> Any:
-    """The largest of 3 x 3 values of a difference."""
-    at = (_EXTREMES + 2 * difference) * PITCH + c
-    return larger(larger(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
-
-
-@numba.njit(cache=True, nogil=True)
-def _smallest_around(rows: Pointer, difference: int, c: int) -> Any:
-    """The smallest of 3 x 3 values of a difference."""
-    at = (_EXTREMES + 2 * difference + 1) * PITCH + c
-    return smaller(smaller(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
+def _around(rows: Pointer, at: int) -> tuple[Any, Any]:
+    """The largest and smallest of 3 x 3 values of a difference, whose extremes of columns begin at a place."""
+    most = larger(larger(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
+    at += PITCH
+    return most, smaller(smaller(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
 
 
 @numba.njit(cache=True, nogil=True)
 def _mark_extremes(rows: Pointer, middle: int, low: Any, high: Any, marks: Pointer, num: int) -> None:
     """Marks (C, 3): of every 16 pixels and each layer the bits of those that are extremes and far enough from zero."""
     for c in range(0, num, WIDTH):
-        most = (
-            _largest_around(rows, 0, c), _largest_around(rows, 1, c), _largest_around(rows, 2, c),
-            _largest_around(rows, 3, c), _largest_around(rows, 4, c),
-        )  # fmt: skip
-        least = (
-            _smallest_around(rows, 0, c), _smallest_around(rows, 1, c), _smallest_around(rows, 2, c),
-            _smallest_around(rows, 3, c), _smallest_around(rows, 4, c),
+        at = _EXTREMES * PITCH + c
+        near = (
+            _around(rows, at), _around(rows, at + 2 * PITCH), _around(rows, at + 4 * PITCH),
+            _around(rows, at + 6 * PITCH), _around(rows, at + 8 * PITCH),
         )  # fmt: skip
         for layer in range(1, NUM_LAYERS + 1):
             v = load(rows, (3 * layer + middle) * PITCH + c + 1)
-            top = larger(larger(most[layer - 1], most[layer]), most[layer + 1])
-            bottom = smaller(smaller(least[layer - 1], least[layer]), least[layer + 1])
-            peaks = where_at_least(v, top) & where_above(v, low)
-            marks[c // WIDTH * NUM_LAYERS + layer - 1] = peaks | (where_at_least(bottom, v) & where_above(high, v))
+            most = larger(larger(near[layer - 1][0], near[layer][0]), near[layer + 1][0])
+            least = smaller(smaller(near[layer - 1][1], near[layer][1]), near[layer + 1][1])
+            peaks = where_at_least(v, most) & where_above(v, low)
+            marks[c // WIDTH * NUM_LAYERS + layer - 1] = peaks | (where_at_least(least, v) & where_above(high, v))
 
 
 @numba.njit(cache=True, nogil=True)

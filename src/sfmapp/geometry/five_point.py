@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.geometry.epipolar import nearest_essential, ray_sampson_error
+from sfmapp.simd.copying import copy_into
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -68,13 +69,15 @@ def find_essential(rays1: Array, rays2: Array, threshold: float, max_trials: int
 def _search(a: Array, b: Array, limit: float, samples: Ints) -> tuple[bool, Array]:
     best, found = np.zeros((3, 3)), False
     best_cost, needed = math.inf, samples.shape[0]
+    essentials = np.empty((10, 3, 3))
     trial = 0
     while trial < needed:
         sample = samples[trial]
         trial += 1
         if len(np.unique(sample)) < 5:
             continue
-        for essential in essentials_of_five(a[sample], b[sample]):
+        for n in range(fill_essentials(a, b, sample, essentials)):
+            essential = essentials[n]
             cost, inliers = 0.0, 0
             for i in range(a.shape[0]):
                 error = ray_sampson_error(essential, a[i, 0], a[i, 1], a[i, 2], b[i, 0], b[i, 1], b[i, 2])
@@ -84,7 +87,7 @@ def _search(a: Array, b: Array, limit: float, samples: Ints) -> tuple[bool, Arra
                     break
             if cost < best_cost:
                 best_cost, found = cost, True
-                best[:] = essential
+                copy_into(best, essential)
                 share = (inliers / a.shape[0]) ** 5
                 if share > 0.0:
                     wanted = math.log(0.001) / math.log1p(-share) if share < 1.0 else 0.0
@@ -94,44 +97,56 @@ def _search(a: Array, b: Array, limit: float, samples: Ints) -> tuple[bool, Arra
 
 @numba.njit(cache=True, nogil=True)
 def essentials_of_samples(a: Array, b: Array, samples: Ints) -> Array:
-    """(K, 3, 3) what :func:`essentials_of_five` finds of each sample (S, 5) of pairs of rays (N, 3)."""
+    """(K, 3, 3) what :func:`fill_essentials` finds of each sample (S, 5) of pairs of rays (N, 3)."""
     out = np.empty((10 * samples.shape[0], 3, 3))
     count = 0
-    for sample in samples:
-        for essential in essentials_of_five(a[sample], b[sample]):
-            out[count] = essential
-            count += 1
+    for n in range(samples.shape[0]):
+        count += fill_essentials(a, b, samples[n], out[count:])
     return out[:count]
 
 
 @numba.njit(cache=True, nogil=True)
-def essentials_of_five(a: Array, b: Array) -> Array:
-    """(K, 3, 3) essential matrices, K <= 10, that five pairs of rays (5, 3) allow."""
-    columns = np.empty((9, 5))
+def fill_essentials(a: Array, b: Array, sample: Ints, out: Array) -> int:
+    """Fill in the essential matrices that five pairs of rays allow; returns how many, 10 at most.
+
+    Whole arrays are not computed with here: what numba brings for that takes longer to compile than all the rest.
+
+    Args:
+        a, b: (N, 3) rays of both cameras; sample: (5,) positions of the pairs.
+        out: (>= 10, 3, 3), filled.
+    """
+    columns, basis, constraints = np.empty((9, 5)), np.empty((4, 9)), np.empty((10, 20))
     for i in range(5):
+        n = sample[i]
         for k in range(3):
             for m in range(3):
-                columns[3 * k + m, i] = b[i, k] * a[i, m]
-    basis, constraints = np.empty((4, 9)), np.empty((10, 20))
+                columns[3 * k + m, i] = b[n, k] * a[n, m]
     if not _fill_null_space(columns, basis):
-        return np.empty((0, 3, 3))
+        return 0
     found = _constraints(basis)
-    for k in range(10):
-        constraints[:, k], constraints[:, 10 + k] = found[:, _ELIMINATED[k]], found[:, _LEFT[k]]
+    for i in range(10):
+        for k in range(10):
+            constraints[i, k], constraints[i, 10 + k] = found[i, _ELIMINATED[k]], found[i, _LEFT[k]]
     if not _eliminate(constraints):
-        return np.empty((0, 3, 3))
-    linear = _linear_in_two(constraints[:, 10:])
+        return 0
+    linear = _linear_in_two(constraints)
     roots = _real_roots(_determinant(linear))
-    out = np.empty((10, 3, 3))
     count = 0
-    for z in roots:
+    for n in range(roots.shape[0]):
+        z = roots[n]
         x, y, w = _null_vector(linear, z)
         if w == 0.0:
             continue
-        essential = (x / w) * basis[0] + (y / w) * basis[1] + z * basis[2] + basis[3]
-        out[count] = essential.reshape(3, 3) / math.sqrt((essential * essential).sum())
+        square = 0.0
+        for i in range(9):
+            value = (x / w) * basis[0, i] + (y / w) * basis[1, i] + z * basis[2, i] + basis[3, i]
+            out[count, i // 3, i % 3] = value
+            square += value * value
+        length = math.sqrt(square)
+        for i in range(9):
+            out[count, i // 3, i % 3] /= length
         count += 1
-    return out[:count]
+    return count
 
 
 # by hand, as numba's LAPACK loads scipy.linalg, which takes longer than the five rays of a whole reconstruction
@@ -205,15 +220,16 @@ def _eliminate(equations: Array) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _linear_in_two(reduced: Array) -> Array:
-    """(3, 3, 5) coefficients, by rising powers of z, of three equations ``a(z) x + b(z) y + c(z) = 0``."""
+    """(3, 3, 5) coefficients, by rising powers of z, of three equations ``a(z) x + b(z) y + c(z) = 0``, from what is
+    left behind the ten eliminated columns."""
     out = np.zeros((3, 3, 5))
     for i in range(3):
         one, other = reduced[4 + 2 * i], reduced[5 + 2 * i]  # the first less z times the second
         for k in range(3):
             degree, start = (3, 6) if k == 2 else (2, 3 * k)
             for power in range(degree + 1):
-                out[i, k, power] += one[start + degree - power]
-                out[i, k, power + 1] -= other[start + degree - power]
+                out[i, k, power] += one[10 + start + degree - power]
+                out[i, k, power + 1] -= other[10 + start + degree - power]
     return out
 
 
@@ -254,10 +270,12 @@ def _null_vector(linear: Array, z: float) -> tuple[float, float, float]:
 def _real_roots(polynomial: Array) -> Array:
     """Simple real roots of a polynomial (n + 1,), by rising powers: those within one, and those of the reversed one."""
     n = polynomial.shape[0] - 1
-    out, found = np.empty(2 * n), np.empty(n)
+    out, found, reversed_polynomial = np.empty(2 * n), np.empty(n), np.empty(n + 1)
+    for k in range(n + 1):
+        reversed_polynomial[k] = polynomial[n - k]
     count = 0
     for is_reversed in range(2):
-        for k in range(_roots_within_one(polynomial[::-1].copy() if is_reversed else polynomial, found)):
+        for k in range(_roots_within_one(reversed_polynomial if is_reversed else polynomial, found)):
             if is_reversed and abs(found[k]) < 1e-12:
                 continue
             out[count] = 1.0 / found[k] if is_reversed else found[k]
@@ -331,9 +349,10 @@ def _constraints(basis: Array) -> Array:
         for j in range(3):
             for k in range(3):
                 _add_square(basis[:, 3 * i + k], basis[:, 3 * j + k], 1.0, square[i, j])
-    trace = square[0, 0] + square[1, 1] + square[2, 2]
-    for i in range(3):
-        square[i, i] -= 0.5 * trace
+    for n in range(10):
+        half = 0.5 * (square[0, 0, n] + square[1, 1, n] + square[2, 2, n])
+        for i in range(3):
+            square[i, i, n] -= half
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -361,3 +380,9 @@ def _add_cube(p: Array, q: Array, out: Array) -> None:
     for i in range(10):
         for j in range(4):
             out[_TO_CUBE[i, j]] += p[i] * q[j]
+
+
+def compile_kernels() -> None:
+    """Run the kernel of samples once, so that numba compiles or loads it now."""
+    rays = np.random.default_rng(0).normal(size=(2, 5, 3))
+    essentials_of_samples(rays[0], rays[1], np.arange(5)[None])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.geometry import epipolar, fundamental_refinement, relative_pose, turned_views
+from sfmapp.geometry import epipolar, five_point, fundamental_refinement, relative_pose, turned_views
 from sfmapp.matching import guided
 from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
@@ -344,6 +344,7 @@ def _pair_report(pair: tuple[int, int], result: MatchedPair) -> PairReport:
 def compile_kernels() -> None:
     """Compile the kernels that this package uses, or load them from numba's cache."""
     epipolar.compile_kernels()
+    five_point.compile_kernels()
     relative_pose.compile_kernels()
     fundamental_refinement.compile_kernels()
     turned_views.compile_kernels()
