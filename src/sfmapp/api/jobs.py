@@ -67,6 +67,7 @@ def reconstruct(
     output: FilePath | None = None,
     options: Options | None = None,
     *,
+    add: bool = False,
     record: bool = True,
     events: Events | None = None,
     threads: int | None = None,
@@ -82,6 +83,8 @@ def reconstruct(
             them again (``densify``, ``undistort``, ``validate``) wants them as files, and says so.
         output: folder of the results: new, empty, or of an earlier run. None: nothing is written.
         options: of all stages; see ``load_options``.
+        add: the photographs, which are files, are added to the finished reconstruction in the output folder, with its
+            options; it is as it was until that is done.
         record: write ``recording.rrd``, which replays the run.
         events: told of everything that happens, and can ask the run to stop.
         threads: workers; None: as ``options.threads`` says, or as many as there are cores.
@@ -91,7 +94,8 @@ def reconstruct(
         The largest model (as it is read back from ``sparse/0``, if it was written), and the report.
 
     Raises:
-        UsageError: the output folder holds something else, or another run is at work in it.
+        UsageError: the output folder holds something else, or another run is at work in it; photographs in memory, or
+            options that differ, are to be added.
         InputError: the photographs do not exist or cannot be read.
         NoReconstructionError: they hold no reconstruction; the report is written.
         TooFewImagesError: fewer images than ``options.min_registered``; everything is written.
@@ -99,8 +103,17 @@ def reconstruct(
 
     Example:
         >>> reconstruction, report = sfmapp.reconstruct("photos/", "out/")
+        >>> reconstruction, report = sfmapp.reconstruct("more/", "out/", add=True)
         >>> reconstruction.points.xyz, reconstruction.image("a.jpg").cam_from_world
     """
+    if add:
+        from sfmapp.pipelines.sparse.add import add_photographs
+
+        if output is None or not isinstance(images, str | os.PathLike):
+            raise UsageError("photographs are added as files, to the reconstruction in an output folder")
+        given = options if options is None and threads is None else options_with(options, threads, seed)
+        found, report = add_photographs(images, output, given, events=events, record=record)
+        return RunResult(Reconstruction.of(found), report)
     options = options_with(options, threads, seed)
     if output is not None:
         from sfmapp.pipelines.sparse import reconstruct as pipeline

@@ -29,6 +29,7 @@ examples:
   sfmapp reconstruct photos/ -o out/ --preset quality --set features.max_num_features=12000
   sfmapp reconstruct photos/ -o out/ --dense --mesh
   sfmapp reconstruct photos/ -o out/ --camera calibration.yaml
+  sfmapp reconstruct more/ -o out/ --add
   sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
 
 The same command again resumes a run that was cut off, does nothing where all is done, and re-runs only what a changed
@@ -44,6 +45,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a quoted glob, or a .txt list of files")
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, created if missing")
+    parser.add_argument(
+        "--add", action="store_true",
+        help="add IMAGES to the finished reconstruction in OUT, with its options; what is there already is told",
+    )  # fmt: skip
     parser.add_argument("--dense", action="store_true", help="also compute dense patches: OUT/dense/fused.ply")
     parser.add_argument("--mesh", action="store_true", help="also make a mesh: OUT/mesh/mesh.ply and mesh.glb")
     parser.add_argument("--texture", action="store_true", help="with --mesh: texture mesh.glb with the photographs")
@@ -205,12 +210,13 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, images: str, options: Options) -> ReconstructionReport:
     load_numba_without_blas()
+    from sfmapp.pipelines.sparse.add import add_photographs
     from sfmapp.pipelines.sparse.reconstruct import reconstruct
     from sfmapp.workspace.usage import Stopwatch
 
-    watch = Stopwatch(whole_process=True)
+    watch, run = Stopwatch(whole_process=True), add_photographs if getattr(args, "add", False) else reconstruct
     with listening(args) as events:
-        result = reconstruct(images, args.output, options, events=events, record=not args.no_recording, watch=watch)
+        result = run(images, args.output, options, events=events, record=not args.no_recording, watch=watch)
     return result.report
 
 
@@ -318,6 +324,10 @@ def _print_summary(output: Path, report: ReconstructionReport) -> None:
         f"{model.num_registered} of {model.num_images} images registered, {model.num_points} points,"
         f" tracks of {model.mean_track_length:.2f}, reprojection error {model.mean_reprojection_error_px:.2f} px"
     )
+    if report.added is not None:
+        print(f"  {report.added.text}")
+        for one in report.added.known:
+            print(f"  {one.name}: {one.reason}")
     for image in report.images:
         if not image.is_registered:
             print(f"  not registered: {image.name}: {image.reason}. {image.remedy}")

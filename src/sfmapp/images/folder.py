@@ -70,11 +70,17 @@ def load_images(
         UsageError: ``camera_params`` with images of several sizes.
         InterruptedRunError: a stop was asked for.
     """
-    start = time.monotonic()
     if isinstance(source, str | os.PathLike):
-        name, found = os.fspath(source), find_images(os.fspath(source), options.mask_path)
-    else:
-        name, found = ", ".join(source), find_files(source)
+        found = find_images(os.fspath(source), options.mask_path)
+        return load_found(os.fspath(source), found, options, events, threads)
+    return load_found(", ".join(source), find_files(source), options, events, threads)
+
+
+def load_found(
+    name: str, found: Found, options: ImageOptions, events: Events, threads: int | None = None
+) -> tuple[ImageSet, ImagesReport]:
+    """Check and describe files that were found; ``name``: of where, for messages. As :func:`load_images`."""
+    start = time.monotonic()
     events.started(STAGE, f"reading {len(found.paths)} files", total=len(found.paths))
     scans: list[_Scan] = []
     skipped = list(found.skipped)

@@ -23,6 +23,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import verified_pairs
+from sfmapp.mapping.carry import carried
 from sfmapp.mapping.closing_move import closing_move, widened_by_move
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
@@ -53,6 +54,20 @@ WEIGHT_AGAINST = 3.0
 MAX_STARTS = 3
 
 
+@dataclass(frozen=True)
+class Ends:
+    """What mapping begins with and ends in, beside what it does itself.
+
+    Attributes:
+        start: finished models of some of the images, known by their names, that mapping goes on with. Where the
+            photographs turn out not to believe a focal length, or which parts are one, it begins anew.
+        closing: called in the end with the finished models, the largest first, to move and adjust them further.
+    """
+
+    start: Sequence[Reconstruction] = ()
+    closing: Callable[[list[Mapper]], None] | None = None
+
+
 def map_images(
     image_set: ImageSet,
     features: Sequence[Features],
@@ -62,7 +77,7 @@ def map_images(
     adjust_options: AdjustOptions,
     threads: int,
     events: Events,
-    closing: Callable[[list[Mapper]], None] | None = None,
+    ends: Ends | None = None,
 ) -> tuple[list[Reconstruction], MappingReport]:
     """Reconstruct cameras and points from verified matches.
 
@@ -73,7 +88,7 @@ def map_images(
         options, adjust_options: what is accepted, and how it is adjusted.
         threads: workers; the result does not depend on it.
         events: told of every decision; ``decided`` events carry a ``snapshot`` of the map for a recording.
-        closing: called in the end with the finished models, the largest first, to move and adjust them further.
+        ends: finished models to begin with, and what is done with those that are finished; None for neither.
 
     Returns:
         The models, the one with most images first, and the report: per image what was tried and why it failed.
@@ -81,6 +96,7 @@ def map_images(
     Raises:
         NoReconstructionError: no model could be started; its ``report`` attribute holds the report.
     """
+    ends = ends or Ends()
     names = [record.name for record in image_set.images]
     image_camera_idx = np.array([record.camera_idx for record in image_set.images], np.int32)
     tracks, track_report = build_tracks(correspondences, features)
@@ -99,7 +115,8 @@ def map_images(
         def map_all(given: list[Camera]) -> Mapped:
             return task.map_from(given, correspondences, tracks)
 
-        mapped = settle_focal_lengths(map_all(list(image_set.cameras)), map_all, events)
+        first_map = task.map_from(list(image_set.cameras), correspondences, tracks, ends.start)
+        mapped = settle_focal_lengths(first_map, map_all, events)
 
         def map_again(found: Correspondences) -> Mapped:
             return task.map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
@@ -121,8 +138,8 @@ def map_images(
             mapper.widening = move.widening(model_reports[n].uncertainty)
             uncertainty = widened_by_move(model_reports[n].uncertainty, move, events)
             model_reports[n] = replace(model_reports[n], uncertainty=uncertainty)
-        if closing is not None:
-            closing(finished)  # which know where the closing loss bends
+        if ends.closing is not None:
+            ends.closing(finished)  # which know where the closing loss bends
     report = MappingReport(
         tracks=track_report,
         focal=mapped.focal_report,
@@ -150,8 +167,11 @@ class _Task:
     pool: Executor
     threads: int
 
-    def map_from(self, given: list[Camera], correspondences: Correspondences, tracks: Tracks) -> Mapped:
-        """Models that begin with the given cameras, from verified matches and their tracks."""
+    def map_from(
+        self, given: list[Camera], correspondences: Correspondences, tracks: Tracks,
+        start: Sequence[Reconstruction] = (),
+    ) -> Mapped:  # fmt: skip
+        """Models that begin with the given cameras, from verified matches and their tracks, or with finished ones."""
         names, options, events = self.names, self.options, self.events
         events.started(STAGE, "mapping", total=len(names))
         cameras, focal_report = first_cameras(given, self.image_camera_idx, correspondences, tracks, options, events)
@@ -166,7 +186,8 @@ class _Task:
             )  # fmt: skip
 
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
-        models, initial_reports = _grow_models(empty, mapper_of, options, events)
+        begun = [carried(model, empty) for model in start]
+        models, initial_reports = _grow_models(empty, mapper_of, options, events, begun)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
         models = [repaired(model, correspondences, mapper_of, options, events) for model in models]
@@ -188,9 +209,11 @@ def _model_report(
 
 
 def _grow_models(
-    empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events
-) -> tuple[list[Reconstruction], list[StartReport]]:
-    """One model after another, each begun from images that no earlier one holds, and the initial pairs tried.
+    empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events,
+    begun: Sequence[Reconstruction] = (),
+) -> tuple[list[Reconstruction], list[StartReport]]:  # fmt: skip
+    """One model after another, each begun from images that no earlier one holds, and the initial pairs tried; before
+    these such as were finished earlier go on.
 
     A model may grow into images of earlier, smaller ones: it may see more of the points that they need. But one that
     holds most of the images is not handed over to what it refused itself, as repeated structure would have it.
@@ -199,6 +222,16 @@ def _grow_models(
     initial_reports: list[StartReport] = []
     seeds = np.ones(len(empty.image_names), bool)
     locked = np.zeros(len(seeds), bool)
+    for taken_up in begun:
+        mapper = mapper_of(taken_up, locked)
+        mapper.take_up()
+        events.advanced(STAGE, int(taken_up.is_registered.sum()))
+        mapper.grow()
+        mapper.finish()
+        seeds &= ~taken_up.is_registered
+        models.append(taken_up)
+        if 2 * taken_up.is_registered.sum() > len(seeds):
+            locked = locked | taken_up.is_registered
     while seeds.sum() >= 2 and (options.multiple_models or not models):
         model, tried = _grow_model(empty, seeds, partial(mapper_of, locked=locked), events)
         initial_reports.append(StartReport(pairs=tried))

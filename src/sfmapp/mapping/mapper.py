@@ -126,6 +126,13 @@ class Mapper:
         self.reconstruction.point_xyz[:] = np.nan
         self.reconstruction.obs_is_inlier[:] = False
 
+    def take_up(self) -> None:
+        """Go on with a model that was finished before: with all that its images see of its points, and the noise of
+        that."""
+        self.triangulate_images(self.reconstruction.registered_idx.tolist())
+        self._settle_points()
+        self.size_at_global = self._size()
+
     # ------------------------------------------------------------------- grow
 
     def grow(self) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
+from sfmapp.report.added_html import added_section
 from sfmapp.report.control_html import control_section, poses_section, units_section
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
@@ -68,7 +69,11 @@ def render_html(
     body = [_headline(report), failure_box(report.outcome), check_table(report.checks)]
     if model is not None:
         note = "Points and cameras of the largest model; each triangle opens where its camera looks."
-        body.append(f'<h2>From above</h2>{top_view_svg(model, _orientation(report, model))}<p class="dim">{note}</p>')
+        new = len(report.added.photographs) if report.added is not None else 0
+        view = top_view_svg(model, _orientation(report, model), new=new)
+        body.append(f'<h2>From above</h2>{view}<p class="dim">{note}</p>')
+    if report.added is not None:
+        body.append(added_section(report.added))
     placed = report.stages.georeference
     if placed is not None:
         is_in_world = any(one.model == 0 and not one.reason for one in placed.models)

@@ -112,20 +112,21 @@ def render_located_html(report: LocatedReport, model: Reconstruction) -> str:
     rows = []
     for one in report.photographs:
         center = [""] * 3 if one.pose is None else [
-            f"{value:.6g} +- {sigma:.2g}" for value, sigma in zip(one.pose.center, one.pose.sigma_center, strict=True)
+            f"{value:.5g} +- {sigma:.1g}" for value, sigma in zip(one.pose.center, one.pose.sigma_center, strict=True)
         ]  # fmt: skip
         turn = None if one.pose is None else f"{max(one.pose.sigma_rotation_deg):.2g}"
         beside = ", ".join(one.matched_with[:_NAMED])
         marks = one.landmarks
         seen = None if marks is None else f"{marks.num_clusters - marks.num_missing} of {marks.num_clusters}"
         rows.append(
-            [("t green" if one.pose else "t red", one.name), *(("", value) for value in center), ("", turn),
-             ("", f"{one.num_points} of {one.num_correspondences}"), ("", seen), ("", f"{one.took.wall_s:.1f}"),
-             ("w", one.reason or (f"the same file as {one.same_as}; " if one.same_as else "") + f"beside {beside}")]
+            [("t green" if one.pose else "t red", one.name),
+             ("w", one.reason or (f"the same file as {one.same_as}; " if one.same_as else "") + f"beside {beside}"),
+             ("", f"{one.num_points} of {one.num_correspondences}"), ("", seen), *(("", value) for value in center),
+             ("", turn), ("", f"{one.took.wall_s:.1f}")]
         )  # fmt: skip
     unit = found[0].pose.unit if found and found[0].pose is not None else "units"
-    head = [("t", "photograph"), *(("", f"{axis}, {unit}") for axis in "xyz"), ("", "rotation, degrees"),
-            ("", "points that agree"), ("", "landmarks in place"), ("", "s"), ("t", "")]  # fmt: skip
+    head = [("t", "photograph"), ("t", ""), ("", "points that agree"), ("", "landmarks in place"),
+            *(("", f"{axis}, {unit}") for axis in "xyz"), ("", "rotation, degrees"), ("", "s")]  # fmt: skip
     warnings = "".join(f"<li>{escape(warning)}</li>" for warning in report.warnings)
     light = "green" if len(found) == len(report.photographs) and not warnings else "amber" if found else "red"
     parts = [

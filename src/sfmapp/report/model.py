@@ -284,6 +284,47 @@ class Stages(Report):
     mesh: MeshRunReport | FailedReport | None = None
 
 
+class AddedPhotograph(Report):
+    """A photograph that was added; ``reason``: why it is in no model, empty where it is in ``model``."""
+
+    name: str
+    model: int | None
+    reason: str
+
+
+class AddedReport(Report):
+    """Photographs that were added to a finished reconstruction.
+
+    Attributes:
+        source: where they are from.
+        photographs: the new ones.
+        known: those that were there already, and as what.
+        linked: photographs that were left over before and are in the model now.
+        num_pairs, num_known_pairs: that were compared, and how many of these before.
+        moved_sigmas: how far the photographs of before have moved, rms, in their standard deviations; absent where
+            these are not known.
+    """
+
+    source: str
+    photographs: Sequence[AddedPhotograph]
+    known: Sequence[NamedReason]
+    linked: Sequence[str]
+    num_pairs: int
+    num_known_pairs: int
+    moved_sigmas: float | None = None
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        here = sum(one.model == 0 for one in self.photographs)
+        text = f"{here} of {len(self.photographs)} photographs of {self.source} were added to the model"
+        if self.linked:
+            text += f", which links {', '.join(self.linked)} as well"
+        if self.moved_sigmas is not None:
+            text += f"; those of before have moved by {self.moved_sigmas:.2g} of their standard deviations"
+        return text
+
+
 class ReconstructionReport(Report):
     """The report of ``sfmapp reconstruct``.
 
@@ -291,6 +332,7 @@ class ReconstructionReport(Report):
         models: the largest first.
         images: what became of each.
         usage: of each stage.
+        added: the photographs that were added last; absent where there were none.
         dense: patches and mesh; absent without.
     """
 
@@ -306,6 +348,7 @@ class ReconstructionReport(Report):
     warnings: Sequence[LogLine]
     decisions: Sequence[LogLine]
     stages: Stages
+    added: AddedReport | None = None
     dense: DensePart | None = None
 
 

@@ -69,6 +69,7 @@ class Manifest(Report):
         options: of all stages, as they were in effect. versions: of what a result depends on.
         seed: of the run. usage: of each step. recording: what became of it.
         image_root: folder that the names of the photographs are relative to.
+        added: where photographs came from that were added to a finished reconstruction, one after the other.
         model, is_upright, photographs: of what was made of another program's model: its folder, whether it counts
             pixels in photographs turned as EXIF says, and the folder of these.
     """
@@ -84,6 +85,7 @@ class Manifest(Report):
     usage: Mapping[str, Usage] | None = None
     recording: str | None = None
     image_root: str | None = None
+    added: Sequence[str] | None = None
     model: str | None = None
     is_upright: bool | None = None
     photographs: str | None = None

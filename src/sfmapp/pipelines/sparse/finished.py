@@ -92,7 +92,7 @@ def read_finished(folder: Path, database: Database, events: Events) -> Finished:
     if missing := [name for name in model.image_names if name not in place]:
         raise InputError(f"{folder}: expected the features of {missing[0]} in its database, found none")
     positions = [place[name] for name in model.image_names]
-    report = _report(folder)
+    report = read_report(folder)
     stages = None if report is None else report.stages
     entries = {} if stages is None or stages.images is None else {e.camera_idx: e for e in stages.images.cameras}
     # the cameras of a model are those of its images; the database has all
@@ -117,7 +117,8 @@ def open_database(folder: Path) -> Database:
     return Database(folder / DATABASE, read_only=True)
 
 
-def _report(folder: Path) -> ReconstructionReport | None:
+def read_report(folder: Path) -> ReconstructionReport | None:
+    """The report of a reconstruction; None if it is gone, or of another version."""
     try:
         return from_plain(ReconstructionReport, read_json(folder / REPORT))
     except ValueError:

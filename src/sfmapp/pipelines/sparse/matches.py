@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sfmapp.features.extract import extract_features
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
 def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[str, ...] = MODULES) -> Correspondences:
     """Features, pairs and matches of photographs, which are put into the run and its database.
+
+    Where photographs are added to others, only pairs with one of them are looked for beside those that there are.
 
     Args:
         modules: whose kernels the run will need, compiled meanwhile.
@@ -40,6 +44,9 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
             pairs, selected = select_pairs(
                 image_set, run.features, options.pairs, seed=options.seed, threads=threads, events=events
             )
+            if run.before is not None and len(run.before.pairs):
+                new = pairs[(pairs >= run.before.num_images).any(axis=1)]
+                pairs = np.unique(np.concatenate([run.before.pairs, new]), axis=0)
             run.stages = replace(run.stages, pairs=selected)
         with run.stage("matching", keys.matching):
             run.correspondences, matched = match_images(

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from sfmapp.adjust.solver import import_ahead
-from sfmapp.errors import NoReconstructionError, TooFewImagesError
+from sfmapp.errors import NoReconstructionError, TooFewImagesError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.georeference.sources import with_positions
@@ -78,14 +78,18 @@ def reconstruct(
         run.listen(recorder)
         report = _run(run)
         model, _ = read_model(run.workspace.model())
-    options = run.options
+    check_enough(report, run.options, output)
+    return RunResult(model, report)
+
+
+def check_enough(report: ReconstructionReport, options: Options, output: str | os.PathLike[str]) -> None:
+    """Raise TooFewImagesError where fewer images are registered than were asked for."""
     found = report.models[0].num_registered
     if options.min_registered is not None and found < options.min_registered:
         raise TooFewImagesError(
             f"{found} images are registered, {options.min_registered} were asked for",
-            f"{output}/report.html tells for every image why",
+            f"{os.fspath(output)}/report.html tells for every image why",
         )
-    return RunResult(model, report)
 
 
 def _run(run: Run) -> ReconstructionReport:
@@ -100,10 +104,20 @@ def _run(run: Run) -> ReconstructionReport:
     keys = stage_keys(run.options, run.image_set, run.control, run.poses)
     if report := results.earlier_report(run, keys):
         return report
+    if added := run.workspace.manifest.added:
+        raise UsageError(
+            f"{run.workspace.folder} holds a model that photographs were added to, those of {added[-1]} last",
+            "nothing in it was touched; add others with --add, or reconstruct into another OUT",
+        )
     run.workspace.note(image_root=os.fspath(run.image_set.root or ""))
     run.note_inputs(keys.inputs)
+    return map_and_report(run, run.image_set, keys)
+
+
+def map_and_report(run: Run, image_set: ImageSet, keys: StageKeys) -> ReconstructionReport:
+    """From photographs to models and their report, all of it written."""
     try:
-        models = _reconstruct(run, run.image_set, keys)
+        models = _reconstruct(run, image_set, keys)
     except NoReconstructionError as failure:
         results.write_results(run, keys, [], failure)
         raise
@@ -112,7 +126,7 @@ def _run(run: Run) -> ReconstructionReport:
 
 def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconstruction]:
     """From photographs to models, the largest first."""
-    from sfmapp.mapping.incremental import map_images
+    from sfmapp.mapping.incremental import Ends, map_images
     from sfmapp.mapping.known_poses import map_known_poses
 
     options, events, threads = run.options, run.events, run.threads
@@ -131,9 +145,11 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
                 poses=held_poses(run, run.poses, image_set),
             )
         else:
+            start = run.before.models if run.before is not None else ()
             models, mapped = map_images(
-                *given, adjust_options=options.adjust, threads=threads, events=events, closing=closing(run, image_set)
-            )
+                *given, adjust_options=options.adjust, threads=threads, events=events,
+                ends=Ends(start, closing(run, image_set)),
+            )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
     return models
 

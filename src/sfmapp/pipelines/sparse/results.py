@@ -79,6 +79,8 @@ def write_results(
     with run.stage("recording"):
         workspace.note(recording=_record(run, models))
     report = _make_report(run, models, failure)
+    if run.added is not None:
+        report = replace(report, added=run.added(models))
     page = render_html(report, models[0] if models else None)
     run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()  # the last measurement that can still be written down

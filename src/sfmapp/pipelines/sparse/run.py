@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.images.load import Images
-from sfmapp.report.model import Stages
+from sfmapp.report.model import AddedReport, Stages
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
 
@@ -18,6 +22,22 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.sparse.known_lengths import KnownLength
     from sfmapp.scene.correspondences import Correspondences
     from sfmapp.scene.features import Features
+    from sfmapp.scene.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class Before:
+    """What there was before photographs were added.
+
+    Attributes:
+        num_images: photographs, which come first.
+        pairs: (P, 2) int32 of them that were compared, i < j, sorted.
+        models: finished, the largest first.
+    """
+
+    num_images: int
+    pairs: NDArray[np.int32]
+    models: list[Reconstruction]
 
 
 @dataclass(kw_only=True)
@@ -31,6 +51,8 @@ class Run(Job):
         stages: what each stage has said.
         control: ground control points that it was given; known: lengths; poses: of photographs.
         georeference: where models lie in the world; None where they do not.
+        before: what photographs are added to; None where they are all new.
+        added: tells what came of those by the models.
     """
 
     images: Images
@@ -43,3 +65,5 @@ class Run(Job):
     known: list[KnownLength] = field(default_factory=list)
     poses: PoseFile | None = None
     georeference: Georeference | None = None
+    before: Before | None = None
+    added: Callable[[Sequence[Reconstruction]], AddedReport] | None = None

@@ -1,0 +1,174 @@
+"""Photographs added in batches to a reconstruction, beside all of them reconstructed at once.
+
+    python benchmarks/adding.py                          # sets with ground truth, several random orders each
+    python benchmarks/adding.py --sets fountain-P11 --orders 5
+
+Each order is five batches: the first is reconstructed (three photographs or more; an order whose first batch is no
+model is told), the others are added with ``--add``. Errors are those of centres and rotations after a similarity, means
+over all photographs; CPU seconds those of all runs of an order together. ``late link``: two views of the courtyard that
+have no match with the first ones, and then those between.
+
+An output that is there already goes on from where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from locating import EXACT, names_in
+from machine import RESULTS, ROOT, describe_machine
+from sfmapp.errors import NoReconstructionError
+from sfmapp.evaluation.poses import evaluate_poses
+from sfmapp.formats.ground_truth import read_ground_truth
+from sfmapp.pipelines.sparse.add import add_photographs
+from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
+from sparse import DATA
+
+SETS = ("fountain-P11", "herz-jesus-P8", "temple-sparse-ring", "strecha-courtyard-21", "lund-door", EXACT)
+NUM_BATCHES, LEAST = 5, 3
+# views of the courtyard: of the fountain, two of the far end of the entry, and those between
+SIDES = (range(10, 15), (8, 9), (*range(8), *range(15, 21)))
+
+
+def folder_of(name: str) -> Path:
+    """A set."""
+    return ROOT / "data" / EXACT if name == EXACT else DATA / name
+
+
+def batches(names: Sequence[str], order: int) -> list[list[str]]:
+    """Five batches of photographs in a random order, the first of three or more."""
+    mixed = [names[i] for i in np.random.default_rng([order, 0xADD]).permutation(len(names))]
+    first = max(LEAST, len(mixed) // NUM_BATCHES)
+    rest = np.array_split(mixed[first:], NUM_BATCHES - 1)
+    return [mixed[:first], *(part.tolist() for part in rest if len(part))]
+
+
+def add_all(name: str, parts: Sequence[Sequence[str]], work: Path) -> list[RunResult]:
+    """The first batch reconstructed, the others added to it, each from a folder of its own."""
+    found = []
+    for n, part in enumerate(parts):
+        (work / f"batch{n}").mkdir(parents=True)
+        for photograph in part:
+            shutil.copyfile(folder_of(name) / "images" / photograph, work / f"batch{n}" / photograph)
+        run = add_photographs if n else reconstruct
+        found.append(run(work / f"batch{n}", work / "out", record=False))
+    return found
+
+
+def errors(name: str, result: RunResult) -> dict[str, Any]:
+    """Of a model against the ground truth."""
+    names = names_in(folder_of(name) / "images")
+    truth = read_ground_truth(folder_of(name) / "cameras.json").for_images(names)
+    model = result.reconstruction
+    found = evaluate_poses(model.image_names, model.cam_from_world, truth.names, truth.cam_from_world).summary()
+    center, rotation = found.center_error_share, found.rotation_error_deg
+    assert center is not None
+    assert rotation is not None
+    return {"registered": found.num_common, "center_share": center.mean, "rotation_deg": rotation.mean}
+
+
+def measure(name: str, order: int, whole: dict[str, Any], work: Path) -> dict[str, Any]:
+    """One order of one set."""
+    names = names_in(folder_of(name) / "images")
+    row: dict[str, Any] = {"case": name, "order": order, "num": len(names), "all": whole}
+    try:
+        found = add_all(name, batches(names, order), work)
+    except NoReconstructionError as error:
+        return row | {"no_start": str(error)}
+    moved = [one.report.added.moved_sigmas for one in found if one.report.added is not None]
+    cpu = sum(one.report.run.cpu_s for one in found)
+    return row | errors(name, found[-1]) | {"cpu_s": cpu, "moved_sigmas": moved}
+
+
+def measure_late_link(work: Path) -> dict[str, Any]:
+    """Views that link to nothing, and then those that link them."""
+    name = "strecha-courtyard-21"
+    names = names_in(folder_of(name) / "images")
+    found = add_all(name, [[names[i] for i in side] for side in SIDES], work)
+    second, third = found[1].report.added, found[2].report.added
+    assert second is not None
+    assert third is not None
+    return {
+        "case": "late link", "registered": [int(one.report.models[0].num_registered) for one in found],
+        "left_over": [{"name": one.name, "model": one.model, "reason": one.reason} for one in second.photographs],
+        "linked": list(third.linked), "models": [len(one.report.models) for one in found],
+    }  # fmt: skip
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """A row for each order."""
+    lines = [f"sfmapp {report['versions']['sfmapp']} at {report['commit']}; {report['cpu']}, {report['date']}.", ""]
+    lines += [
+        "| set | order | registered (all at once) | centres off, share of the size (all at once) | ratio "
+        "| rotations, degrees (all at once) | ratio | CPU s (all at once) |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in report["rows"]:
+        whole = row.get("all")
+        if whole is None:
+            continue
+        if "no_start" in row:
+            lines.append(f"| {row['case']} | {row['order']} | no model of the first batch | | | | | |")
+            continue
+        lines.append(
+            f"| {row['case']} | {row['order']} | {row['registered']} ({whole['registered']}) of {row['num']} "
+            f"| {row['center_share']:.2e} ({whole['center_share']:.2e}) "
+            f"| {row['center_share'] / whole['center_share']:.3f} "
+            f"| {row['rotation_deg']:.4f} ({whole['rotation_deg']:.4f}) "
+            f"| {row['rotation_deg'] / whole['rotation_deg']:.3f} | {row['cpu_s']:.0f} ({whole['cpu_s']:.0f}) |"
+        )
+    for row in report["rows"]:
+        if row["case"] == "late link":
+            sides = ", ".join(str(n) for n in row["registered"])
+            reasons = "; ".join(sorted({one["reason"] for one in row["left_over"] if one["model"] != 0}))
+            text = f"Late link: {sides} views in the largest model after each batch. Those of the second: {reasons}."
+            lines += ["", f"{text} Linked by the third: {len(row['linked'])}."]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sets", nargs="*", default=SETS)
+    parser.add_argument("--orders", type=int, default=3)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "adding.json")
+    args = parser.parse_args()
+    report: dict[str, Any] = describe_machine() | {"rows": []}
+    if args.output.exists():
+        report = json.loads(args.output.read_text(encoding="utf-8"))
+    rows = report["rows"]
+
+    def keep(row: dict[str, Any]) -> None:
+        rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        args.output.write_text(json.dumps(report, indent=1) + "\n")
+        args.output.with_suffix(".md").write_text(markdown(report) + "\n")
+
+    if not any(row["case"] == "late link" for row in rows):
+        with tempfile.TemporaryDirectory() as work:
+            keep(measure_late_link(Path(work)))
+    for name in args.sets:
+        done = [row for row in rows if row["case"] == name]
+        whole = done[0]["all"] if done else None
+        for order in range(args.orders):
+            if any(row["order"] == order for row in done):
+                continue
+            with tempfile.TemporaryDirectory() as work:
+                if whole is None:
+                    found = reconstruct(folder_of(name) / "images", Path(work) / "whole", record=False)
+                    whole = errors(name, found) | {"cpu_s": found.report.run.cpu_s}
+                keep(measure(name, order, whole, Path(work) / "parts"))
+    print(markdown(report))
+
+
+if __name__ == "__main__":
+    main()
