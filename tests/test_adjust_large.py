@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 
 from sfmapp.adjust import progress, solver
+from sfmapp.adjust.covariance import reduced_matrix
 from sfmapp.adjust.elimination import GROUP
 from sfmapp.adjust.envelope import EnvelopeSystem
-from sfmapp.adjust.linear import choose_solver
+from sfmapp.adjust.linear import choose_solver, prefers_rounds
 from sfmapp.adjust.options import AdjustOptions
+from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle, make_engine
 from sfmapp.camera.camera import project
+from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3
-from sfmapp.scene.synthetic import make_scene, perturb
+from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera, synthetic_rig
 
 OPTIONS = AdjustOptions(loss="cauchy", loss_scale_px=1.0)
 
@@ -173,3 +176,56 @@ def test_long_adjustments_tell_of_every_step_and_short_ones_of_none(monkeypatch)
     events = Events(lambda event: events.cancel() if event.kind == "advanced" else None)
     with pytest.raises(InterruptedRunError):
         adjust_bundle(start_of(scene), OPTIONS, events=events)
+
+
+def iterative_engine(monkeypatch, model, options=OPTIONS, **given):
+    monkeypatch.setattr(solver, "choose_solver", lambda *_, **__: "envelope")
+    monkeypatch.setattr(solver, "prefers_rounds", lambda *_: True)
+    monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+    return make_engine(model, options, may_iterate=True, **given)
+
+
+@pytest.mark.parametrize("kind", ["shared", "wide", "own", "rig", "held"])
+def test_a_product_with_the_system_that_is_never_made_is_that_with_its_tiles(monkeypatch, kind):
+    """Against the dense reduced system, with shared, long and single intrinsics, mounted cameras and constant poses."""
+    cameras = {"wide": synthetic_camera(CameraModel.FULL_OPENCV), "own": [synthetic_camera()] * 40}.get(kind)
+    scene = make_scene(4, 40, 300, cameras, rig=synthetic_rig() if kind == "rig" else None)
+    varying = Varying(images=np.arange(40) > 3) if kind == "held" else Varying()
+    options = AdjustOptions(refine_principal_point=kind == "wide")
+    direct = make_engine(scene.observed, options, varying)
+    direct.linearize(0.01, map)
+    engine = iterative_engine(monkeypatch, scene.observed, options, varying=varying)
+    assert engine.solver == "iterative"
+    engine.linearize(0.01, map)
+    np.testing.assert_allclose(engine.gradient[0], direct.gradient[0], rtol=1e-12, atol=1e-12)
+    used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
+    x = np.where(used, np.random.default_rng(0).normal(size=len(used)) / np.sqrt(engine.diagonal), 0.0)
+    expected = (reduced_matrix(direct) @ x + 0.01 * direct.diagonal * x)[used]
+    np.testing.assert_allclose(engine._product(x, map)[used], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_rounds_come_to_the_minimum_that_exact_steps_come_to(monkeypatch):
+    scene = make_scene(3, 40, 500)
+    exact, found = start_of(scene), []
+    tight = AdjustOptions(loss="cauchy", loss_scale_px=1.0, relative_cost_tolerance=1e-10)
+    expected = adjust_bundle(exact, tight)
+    monkeypatch.setattr(solver, "_CHUNK_OBSERVATIONS", 1000)
+    for threads in (1, 3):
+        model = start_of(scene)
+        engine = iterative_engine(monkeypatch, model, tight)
+        assert engine.num_chunks > 2
+        report = solver.run_engine(engine, model, tight, threads=threads, events=None)
+        found.append(model)
+    assert report.solver == "iterative"
+    assert report.final_cost == pytest.approx(expected.final_cost, rel=1e-8)
+    assert report.num_iterations <= expected.num_iterations + 5
+    assert (found[0].cam_from_world == found[1].cam_from_world).all()
+    assert found[0].cameras[0].focal == pytest.approx(exact.cameras[0].focal, rel=1e-6)
+
+
+def test_rounds_are_for_what_is_large_and_full():
+    # entries, products and the factor of 300, 1,000 and 3,000 photographs of a room, and of 3,000 along a street
+    assert not prefers_rounds(600_000, 20_000_000, 2e9)
+    assert prefers_rounds(2_100_000, 133_000_000, 7.5e10)
+    assert prefers_rounds(6_300_000, 400_000_000, 2e12)
+    assert not prefers_rounds(2_000_000, 13_000_000, 2e9)

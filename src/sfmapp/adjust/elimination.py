@@ -117,17 +117,15 @@ def find_runs(meetings: Meetings, batches: Ints) -> tuple[Ints, Int32s, Int32s]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(meetings: Meetings, runs: Runs, pairs: NDArray[np.bool_], products: Ints) -> None:
+def mark_pairs(meetings: Meetings, pairs: NDArray[np.bool_], products: Ints) -> None:
     """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point; products (G,) counts those of each
-    group."""
-    block, num_groups = meetings.block, products.shape[0]
-    for n in range(runs.ptr.shape[0] - 1):
-        for q in range(runs.ptr[n], runs.ptr[n + 1]):
-            for e in range(runs.first[q], runs.last[q]):
-                first, last = max(meetings.partners[e, 0], e), meetings.partners[e, 1]
-                products[n % num_groups] += last - first
-                for m in range(first, last):
-                    pairs[block[e], block[m]] = True
+    group of rows."""
+    block = meetings.block
+    for e in range(block.shape[0]):
+        first, last = meetings.partners[e]
+        products[block[e] // GROUP] += last - first
+        for m in range(first, last):
+            pairs[block[e], block[m]] = True
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -101,10 +101,10 @@ class EnvelopeSystem:
     there are, ``run`` maps tasks on threads.
     """
 
-    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints, order: EnvelopeOrder | None = None) -> None:
         a, b = np.divmod(keys, len(block_dim))
         self._dim = block_dim
-        self.order = order = EnvelopeOrder(block_dim, a, b)
+        self.order = order = order or EnvelopeOrder(block_dim, a, b)
         self._begin = order.start[order.first]
         self._panels = [
             np.zeros((end - start, end - begin))
@@ -129,19 +129,27 @@ class EnvelopeSystem:
 
     def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
         """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
+        return self.substitute(rhs) if self.factor(tiles, run) else None
+
+    def factor(self, tiles: Array, run: Callable[..., Any] = map) -> bool:
+        """Factor the system in tiles (N * 64,); False where it is not positive definite."""
         num = len(self._panels)
         list(run(lambda i: _gather(tiles, self._places[i], self._panels[i]), range(num)))
         diagonal = [panel[:, -len(panel) :].diagonal().copy() for panel in self._panels]
         for k in range(num):
             below = [i for i in range(k + 1, num) if self.order.first[i] <= k]
             if not self._factor_diagonal(k, diagonal[k]):
-                return None
+                return False
             list(run(lambda i, k=k: self._eliminate(i, k), below))
+        return True
+
+    def substitute(self, rhs: Array) -> Array:
+        """Solution (B * 8,) for a right-hand side (B * 8,), with the factor."""
         used = np.arange(8) < self._dim[:, None]
         at = (self._at[:, None] + np.arange(8))[used]
         x = np.empty(self.order.start[-1])
         x[at] = rhs.reshape(-1, 8)[used]
-        self._substitute(x)
+        self._substitute_panels(x)
         step = np.zeros((len(self._dim), 8))
         step[used] = x[at]
         return step.ravel()
@@ -182,7 +190,7 @@ class EnvelopeSystem:
             block -= left @ right.T
         block[:] = block @ self._inverse[k].T
 
-    def _substitute(self, x: Array) -> None:
+    def _substitute_panels(self, x: Array) -> None:
         """Solve L L^T x = b in place."""
         start, num = self.order.start, len(self._panels)
         for i in range(num):

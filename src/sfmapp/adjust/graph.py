@@ -206,7 +206,7 @@ class FactorGraph:
                 extra_factors=extras, noise_px=self.noise_px, events=events,
             )  # fmt: skip
         else:
-            engine = self._engine(extras, is_closing=True)
+            engine = self._engine(extras, is_closing=True, may_iterate=True)
             report = run_engine(engine, self.reconstruction, self.options, threads=self._threads, events=events)
         if extras is not None:
             self._values = extras.values
@@ -324,10 +324,10 @@ class FactorGraph:
 
         return ExtraFactors(self.factors, self.values, points, self._kinds)
 
-    def _engine(self, extras: Any, *, is_closing: bool) -> Engine:
+    def _engine(self, extras: Any, *, is_closing: bool, may_iterate: bool = False) -> Engine:
         return make_engine(
             self.reconstruction, self.options, self._varying, prior_cameras=self._prior_cameras, extra_factors=extras,
-            is_closing=is_closing, noise_px=self.noise_px,
+            is_closing=is_closing, may_iterate=may_iterate, noise_px=self.noise_px,
         )  # fmt: skip
 
     def _measured_noise(self) -> float:

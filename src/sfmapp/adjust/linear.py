@@ -19,7 +19,7 @@ from sfmapp.simd.f64x8 import assign8, subtract8
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SolverName = Literal["tiles", "gtsam", "lapack", "envelope"]
+SolverName = Literal["tiles", "gtsam", "lapack", "envelope", "iterative"]
 
 # Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. Up to 400 unknowns, some
 # 65 poses, LAPACK is as quick as gtsam at any fill, for so few poses fill much of their system when they are eliminated
@@ -28,6 +28,10 @@ _SMALL, _SPARSE_FILL = 400, 0.25
 # Up to so many blocks nothing beats the tiles of the quick rounds by much; beyond that the envelope is quickest at any
 # fill, by up to five times.
 _FEW_BLOCKS = 160
+# Seconds of a multiplication and addition of the envelope, of a product of two blocks that meet in a point, and of a
+# block of a point in a round of conjugate gradients; and rounds of a step. Inexact steps are more: rounds must be
+# quicker by so many times.
+_FLOP_S, _PRODUCT_S, _ENTRY_S, _ROUNDS, _CLEARLY = 1 / 45e9, 12e-9, 12e-9, 40, 2.0
 # Poses that gtsam eliminates together.
 _GROUP = 6
 # What rounding leaves of a zero pivot, against the diagonal before.
@@ -51,6 +55,15 @@ def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing
     if is_closing:
         return "gtsam" if may_suit_gtsam(num_blocks, num_unknowns) and is_sparse(fill) else "lapack"
     return "tiles"
+
+
+def prefers_rounds(num_entries: int, num_products: int, flops: float) -> bool:
+    """Whether conjugate gradients are clearly quicker than making the reduced system and factoring it.
+
+    Args:
+        num_entries: blocks that meet a point, over all points. num_products: pairs of them. flops: of the factor.
+    """
+    return _PRODUCT_S * num_products + _FLOP_S * flops > _CLEARLY * _ROUNDS * _ENTRY_S * num_entries
 
 
 def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:

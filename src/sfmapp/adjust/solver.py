@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib import import_module
 from threading import Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ from sfmapp.adjust.linear import (
     choose_solver,
     may_suit_gtsam,
     one_blas_thread,
+    prefers_rounds,
 )
 from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
@@ -44,6 +45,9 @@ from sfmapp.adjust.progress import StepProgress
 from sfmapp.camera.camera import Camera
 from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
+
+if TYPE_CHECKING:
+    from sfmapp.adjust.iterative import IterativeSystem
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -110,7 +114,7 @@ def adjust_bundle(
     is_closing = extra_factors is not None and extra_factors.size() > 0
     engine = make_engine(
         reconstruction, options, varying, prior_cameras=prior_cameras, extra_factors=extra_factors,
-        is_closing=is_closing,
+        is_closing=is_closing, may_iterate=True,
     )  # fmt: skip
     return run_engine(engine, reconstruction, options, threads=threads, events=events)
 
@@ -147,6 +151,7 @@ def make_engine(
     prior_cameras: Sequence[Camera] | None = None,
     extra_factors: Any = None,
     is_closing: bool = False,
+    may_iterate: bool = False,
     noise_px: float = 1.0,
 ) -> Engine:
     """The engine over a reconstruction's problem, priors and extra factors; arguments as of :func:`adjust_bundle`.
@@ -154,6 +159,8 @@ def make_engine(
     Args:
         extra_factors: a gtsam graph, or what was made of one.
         is_closing: the reduced system is left to gtsam or LAPACK.
+        may_iterate: where it is so large and full that conjugate gradients are clearly quicker it is never made: for
+            those who want steps, and no more.
         noise_px: of a pixel coordinate, against which priors and extra factors are weighed.
     """
     extras = extra_factors
@@ -167,7 +174,7 @@ def make_engine(
     if extras is not None:
         extras.attach(problem)
     priors = IntrinsicPriors(problem, prior_cameras, options)
-    return Engine(problem, options, priors, extras, is_closing=is_closing, noise_px=noise_px)
+    return Engine(problem, options, priors, extras, is_closing=is_closing, may_iterate=may_iterate, noise_px=noise_px)
 
 
 class Engine:
@@ -181,6 +188,7 @@ class Engine:
         extras: Any = None,
         *,
         is_closing: bool = False,
+        may_iterate: bool = False,
         noise_px: float = 1.0,
     ) -> None:
         p = problem
@@ -196,8 +204,10 @@ class Engine:
         self.system: ReducedSystem | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
-        self._arrange_points()
-        self._arrange_tiles(is_closing)
+        self.meetings = Meetings(p.block_dim, *find_meetings(p.points, p.images(self.rows), p.lenses, blocks))
+        self.iterative: IterativeSystem | None = None
+        products = self._arrange_tiles(is_closing, may_iterate)
+        self._arrange_points(products)
         chunks = self.num_chunks
         num_cross = images if (p.second_block < 0).all() else 2 * images + len(p.camera_idx)
         self.tiles = aligned_zeros(len(self.tile_rows.column) * 64)
@@ -212,29 +222,11 @@ class Engine:
         self.new_canonical, self.new_xyz = np.empty_like(p.canonical), np.empty_like(p.xyz)
         self.damping = self.shape_decrease = 0.0
 
-    def _arrange_points(self) -> None:
-        """See which blocks meet in each point, and part points in batches of chunks."""
-        p = self.problem
-        found = find_meetings(p.points, p.images(self.rows), p.lenses, p.num_blocks)
-        self.meetings = Meetings(p.block_dim, *found)
-        ptr, num_points = self.meetings.ptr, len(p.track_idx)
-        num_batches = max(1, -(-int(ptr[-1]) // _BATCH_ENTRIES))
-        batches = np.searchsorted(ptr, np.linspace(0, int(ptr[-1]), num_batches + 1))
-        batches[0], batches[-1] = 0, num_points
-        self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, _MAX_CHUNKS))
-        ends = p.point_ptr[batches]
-        self.limits = np.searchsorted(p.point_ptr, np.linspace(ends[:-1], ends[1:], self.num_chunks + 1, axis=1))
-        self.limits[:, 0], self.limits[:, -1] = batches[:-1], batches[1:]
-        self.shares = np.searchsorted(p.point_ptr, np.linspace(0, p.num_observations, self.num_chunks + 1))
-        self.shares[0], self.shares[-1] = 0, num_points
-        self.runs = Runs(*find_runs(self.meetings, batches))
-        self.point_rows = aligned_zeros(int(np.diff(ptr[batches]).max(initial=0)) * 24)
-
-    def _arrange_tiles(self, is_closing: bool) -> None:
-        """Choose what solves, the tiles that are kept, and parts of their rows that cost alike."""
+    def _arrange_tiles(self, is_closing: bool, may_iterate: bool) -> Ints:
+        """Choose what solves, and the tiles that are kept; returns how many products each group of their rows sums."""
         p, blocks = self.problem, self.problem.num_blocks
         met, products = np.eye(blocks, dtype=bool), np.zeros(-(-blocks // GROUP), np.int64)
-        mark_pairs(self.meetings, self.runs, met, products)
+        mark_pairs(self.meetings, met, products)
         other, second = p.camera_block[p.image_camera], p.second_block
         shared = (p.image_block >= 0) & (other >= 0)
         met[p.image_block[shared], other[shared]] = True
@@ -248,15 +240,24 @@ class Engine:
         if blocks and (is_closing or not is_small):
             self.fill = 2 * len(keys) / (blocks * (blocks + 1))
             self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
+        order = None
+        if self.solver == "envelope":
+            from sfmapp.adjust.envelope import EnvelopeOrder, EnvelopeSystem  # loads scipy
+
+            order = EnvelopeOrder(p.block_dim, *np.divmod(keys, blocks))
+            num_entries, num_products = len(self.meetings.block), int(products.sum())
+            if may_iterate and self.extras is None and prefers_rounds(num_entries, num_products, order.flops):
+                from sfmapp.adjust.iterative import IterativeSystem, is_of_cluster
+
+                self.solver = "iterative"
+                keys = keys[is_of_cluster(*np.divmod(keys, blocks))]
+                self.iterative = IterativeSystem(p.block_dim, keys, np.arange(len(keys)))
         if is_small or self.solver == "tiles":
             self.tile_keys = np.arange(blocks * blocks)
         else:
             self.tile_keys, numbers = keys, np.arange(len(keys))
         row, column = np.divmod(self.tile_keys, max(1, blocks))
         self.tile_rows = TileRows(np.searchsorted(row, np.arange(blocks + 1)), column)
-        num_parts = int(np.clip(products.sum() // _PART_PRODUCTS, 1, _MAX_PARTS))
-        self.parts = np.searchsorted(np.cumsum(products), np.linspace(0, products.sum(), num_parts + 1))
-        self.parts[0], self.parts[-1] = 0, len(products)
         if self.solver == "gtsam":
             from sfmapp.adjust.factors import SparseSystem
 
@@ -264,9 +265,27 @@ class Engine:
         elif self.solver == "lapack":
             self.system = LapackSystem(p.block_dim, keys, numbers)
         elif self.solver == "envelope":
-            from sfmapp.adjust.envelope import EnvelopeSystem  # loads scipy
+            self.system = EnvelopeSystem(p.block_dim, keys, numbers, order)
+        return products
 
-            self.system = EnvelopeSystem(p.block_dim, keys, numbers)
+    def _arrange_points(self, products: Ints) -> None:
+        """Part points in batches of chunks, and groups of rows of tiles in parts that cost alike by their products."""
+        p, ptr, num_points = self.problem, self.meetings.ptr, len(self.problem.track_idx)
+        # rounds go over all points again and again
+        num_batches = 1 if self.iterative is not None else max(1, -(-int(ptr[-1]) // _BATCH_ENTRIES))
+        batches = np.searchsorted(ptr, np.linspace(0, int(ptr[-1]), num_batches + 1))
+        batches[0], batches[-1] = 0, num_points
+        self.num_chunks = int(np.clip(p.num_observations // _CHUNK_OBSERVATIONS, 1, _MAX_CHUNKS))
+        ends = p.point_ptr[batches]
+        self.limits = np.searchsorted(p.point_ptr, np.linspace(ends[:-1], ends[1:], self.num_chunks + 1, axis=1))
+        self.limits[:, 0], self.limits[:, -1] = batches[:-1], batches[1:]
+        self.shares = np.searchsorted(p.point_ptr, np.linspace(0, p.num_observations, self.num_chunks + 1))
+        self.shares[0], self.shares[-1] = 0, num_points
+        self.runs = Runs(*find_runs(self.meetings, batches))
+        self.point_rows = aligned_zeros(int(np.diff(ptr[batches]).max(initial=0)) * 24)
+        num_parts = int(np.clip(products.sum() // _PART_PRODUCTS, 1, _MAX_PARTS))
+        self.parts = np.searchsorted(np.cumsum(products), np.linspace(0, products.sum(), num_parts + 1))
+        self.parts[0], self.parts[-1] = 0, len(products)
 
     @property
     def num_tasks(self) -> int:
@@ -275,7 +294,7 @@ class Engine:
 
     def lone(self) -> AbstractContextManager[Any]:
         """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
-        return one_blas_thread() if self.solver in ("lapack", "envelope") else nullcontext()
+        return one_blas_thread() if self.solver in ("lapack", "envelope", "iterative") else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state."""
@@ -334,13 +353,34 @@ class Engine:
         place = self.tile_numbers(np.arange(blocks) * (blocks + 1))[:, None] * 64 + np.arange(8) * 9
         used = np.arange(8) < p.block_dim[:, None]
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
-        if self.system is None:
-            self.system = TileSystem(blocks)
-        found = self.system.solve(tiles, right.copy(), run)
+        if self.iterative is not None:
+            found = self.iterative.solve_with(lambda x: self._product(x, run), tiles, right, run)
+        else:
+            if self.system is None:
+                self.system = TileSystem(blocks)
+            found = self.system.solve(tiles, right.copy(), run)
         if found is None or not np.isfinite(found).all():
             return None
         self.shape_decrease = 0.5 * float(right @ found)
         return found
+
+    def _product(self, x: Array, run: Callable[..., Any]) -> Array:
+        """The damped reduced system times x (B * 8,), by the points, without its tiles."""
+        from sfmapp.adjust.iterative import add_block_products, add_point_products
+
+        p, out = self.problem, np.zeros((self.num_chunks, len(x)))
+
+        def chunk(k: int) -> None:
+            part = int(self.limits[0, k]), int(self.limits[0, k + 1])
+            add_point_products(part, self.meetings, self.point_rows, x, out[k])
+
+        list(run(chunk, range(self.num_chunks)))
+        for k in range(1, self.num_chunks):
+            out[0] += out[k]
+        add_block_products(self.own[0], self.cross[0], p.images(self.rows), p.lenses, x, out[0])
+        used = (np.arange(8) < p.block_dim[:, None]).ravel()
+        total: Array = out[0] + self.damping * self.diagonal * used * x
+        return total
 
     def has_settled(self, sigmas: float, cost: float, decrease: float) -> bool:
         """Whether the last step, which lowered the cost so much, moved no combination of the blocks by more than so

@@ -1,0 +1,140 @@
+"""Systems that are too large and too full to be factored: conjugate gradients on the Schur complement, which is applied
+and never made (Agarwal, Snavely, Seitz and Szeliski, "Bundle Adjustment in the Large", ECCV 2010).
+
+A product with it passes once over the ``Z`` of all points (:func:`sfmapp.adjust.kernels.reduce_points`). The
+preconditioner has the tiles of clusters of neighbouring blocks, factored exactly (as in Kushal and Agarwal, CVPR 2012);
+the rest of the reduced system is not there. Steps need not be exact: rounds stop when the quadratic model gains little
+more (Nash and Sofer 1990), and the closer the nearer the minimum is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.envelope import EnvelopeSystem
+from sfmapp.adjust.kernels import ImageArrays, LensArrays, Meetings
+from sfmapp.simd.pointers import pointer
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Blocks of a cluster of the preconditioner: the columns of tiles that are summed at once.
+CLUSTER = 32
+# A step of the model is wanted to this share at first, and to the last one near the minimum; the most rounds of a step.
+_LOOSE, _TIGHT, _MAX_ROUNDS = 0.1, 1e-3, 300
+
+
+def is_of_cluster(first: Ints, second: Ints) -> NDArray[np.bool_]:
+    """(N,) which pairs of blocks are of one cluster."""
+    same: NDArray[np.bool_] = first // CLUSTER == second // CLUSTER
+    return same
+
+
+class IterativeSystem:
+    """Conjugate gradients with a clustered preconditioner; keys and numbers as of ``EnvelopeSystem``, of pairs of one
+    cluster."""
+
+    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
+        self._clusters = EnvelopeSystem(block_dim, keys, numbers)
+        self._used = (np.arange(8) < block_dim[:, None]).ravel()
+        self._last_gradient = np.inf
+        self.num_rounds = 0
+
+    def solve_with(
+        self, product: Callable[[Array], Array], tiles: Array, rhs: Array, run: Callable[..., Any]
+    ) -> Array | None:
+        """Solution (B * 8,), None where the system is not positive definite.
+
+        Args:
+            product: of the damped reduced system with a vector (B * 8,). tiles: of the damped clusters. rhs: (B * 8,).
+        """
+        if not self._clusters.factor(tiles, run):
+            return None
+        x, rest = np.zeros(len(rhs)), np.where(self._used, rhs, 0.0)
+        better = self._clusters.substitute(rest)
+        direction, gain, gained = better, float(rest @ better), 0.0
+        wanted = self._forcing(np.sqrt(max(gain, 0.0)))
+        self.num_rounds = 0
+        for n in range(1, _MAX_ROUNDS + 1):
+            image = product(direction)
+            curvature = float(direction @ image)
+            if not curvature > 0.0:
+                return x if n > 1 else None
+            length = gain / curvature
+            x += length * direction
+            rest -= length * image
+            self.num_rounds, more = n, 0.5 * length * gain
+            gained += more
+            if n * more <= wanted * gained:
+                break
+            better = self._clusters.substitute(rest)
+            before, gain = gain, float(rest @ better)
+            direction = better + gain / before * direction
+        return x
+
+    def _forcing(self, gradient: float) -> float:
+        """How closely the model is to be solved, by how much the gradient has shrunk (Eisenstat and Walker 1996)."""
+        ratio = gradient / self._last_gradient if self._last_gradient > 0.0 else 1.0
+        self._last_gradient = gradient
+        return float(np.clip(0.9 * ratio**2, _TIGHT, _LOOSE))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_point_products(part: tuple[int, int], meetings: Meetings, rows: Array, x: Array, out: Array) -> None:
+    """Take ``Z Z^T x`` of points ``part[0]`` to ``part[1]`` off out (B * 8,); rows as of ``reduce_points``."""
+    ptr, block = meetings.ptr, meetings.block
+    total = np.zeros(24)
+    sums, Z, source, target = pointer(total), pointer(rows), pointer(x), pointer(out)
+    for p in range(part[0], part[1]):
+        for n in range(24):
+            sums[n] = 0.0
+        for e in range(ptr[p], ptr[p + 1]):
+            b = 8 * block[e]
+            for k in range(3):
+                for n in range(8):
+                    sums[8 * k + n] += Z[24 * e + 8 * k + n] * source[b + n]
+        t0 = t1 = t2 = 0.0
+        for n in range(8):
+            t0 += sums[n]
+            t1 += sums[8 + n]
+            t2 += sums[16 + n]
+        for e in range(ptr[p], ptr[p + 1]):
+            b = 8 * block[e]
+            for n in range(8):
+                target[b + n] -= Z[24 * e + n] * t0 + Z[24 * e + 8 + n] * t1 + Z[24 * e + 16 + n] * t2
+    total[0] = 0.0  # kept alive so far
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_block_products(own: Array, cross: Array, images: ImageArrays, lenses: LensArrays, x: Array, out: Array) -> None:
+    """Add to out (B * 8,) the product of the system before elimination with x: own (B * 64,) of blocks with themselves,
+    cross of poses with intrinsics, as of :class:`sfmapp.adjust.kernels.Sums`."""
+    num_images = images.block.shape[0]
+    for a in range(x.shape[0] // 8):
+        for j in range(8):
+            for k in range(8):
+                out[8 * a + j] += own[64 * a + 8 * j + k] * x[8 * a + k]
+    for i in range(num_images):
+        a, c = images.block[i], images.camera[i]
+        b, second = lenses.block[c], lenses.second[c]
+        if a >= 0 and b >= 0 and a != b:
+            _add_both(cross, i, a, b, x, out)
+            if second >= 0:
+                _add_both(cross, num_images + i, a, second, x, out)
+    for c in range(lenses.block.shape[0]):
+        if lenses.second[c] >= 0:
+            _add_both(cross, 2 * num_images + c, lenses.block[c], lenses.second[c], x, out)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_both(cross: Array, source: int, a: int, b: int, x: Array, out: Array) -> None:
+    """A tile beside the diagonal and its transpose."""
+    for j in range(8):
+        for k in range(8):
+            out[8 * a + j] += cross[64 * source + 8 * j + k] * x[8 * b + k]
+            out[8 * b + k] += cross[64 * source + 8 * j + k] * x[8 * a + j]
