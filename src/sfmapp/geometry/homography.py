@@ -10,11 +10,13 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.geometry.dlt import homogeneous, homography_rows, normalizing
+from sfmapp.geometry.epipolar import contiguous
 from sfmapp.geometry.fit import (
     CAUCHY_SIGMAS,
     FitInfo,
@@ -36,17 +38,26 @@ def transfer_errors(homography: Array, xy1: Array, xy2: Array) -> Array:
     horizon of either map and for a singular H.
     """
     determinant = np.linalg.det(homography) if np.isfinite(homography).all() else 0.0
-    if abs(determinant) < 1e-14 * np.linalg.norm(homography) ** 3:
-        return np.full(len(xy1), np.inf)
-    h = homography * np.sign(determinant)
-    return np.maximum(_one_way(h, xy1, xy2), _one_way(np.linalg.inv(h), xy2, xy1))
+    errors = np.full(len(xy1), np.inf)
+    if abs(determinant) >= 1e-14 * np.linalg.norm(homography) ** 3:
+        h = homography * np.sign(determinant)
+        _transfer_errors(*contiguous(h, np.linalg.inv(h)), *contiguous(xy1, xy2), errors)
+    return errors
 
 
-def _one_way(h: Array, source: Array, target: Array) -> Array:
-    mapped = source @ h[:, :2].T + h[:, 2]
-    in_front = mapped[:, 2] > 0
-    w = np.where(in_front, mapped[:, 2], 1.0)[:, None]
-    return np.where(in_front, ((mapped[:, :2] / w - target) ** 2).sum(1), np.inf)
+@numba.njit(cache=True, nogil=True)
+def _transfer_errors(h: Array, inverse: Array, xy1: Array, xy2: Array, out: Array) -> None:
+    """Fill out (N,), infinite before, with the larger of both directions where both are in front."""
+    for i in range(xy1.shape[0]):
+        x, y, u, v = xy1[i, 0], xy1[i, 1], xy2[i, 0], xy2[i, 1]
+        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+        z = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
+        if w > 0.0 and z > 0.0:
+            du = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w - u
+            dv = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w - v
+            dx = (inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]) / z - x
+            dy = (inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]) / z - y
+            out[i] = max(du * du + dv * dv, dx * dx + dy * dy)
 
 
 class PlaneMotions(NamedTuple):
@@ -318,3 +329,9 @@ def rotation_from_rays(xn1: Array, xn2: Array, weights: Array) -> Array:
     u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
     rotation: Array = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of this module, or load them from numba's cache."""
+    points = np.array([[0.1, 0.2], [0.3, -0.1]])
+    transfer_errors(np.eye(3), points, points)

@@ -125,7 +125,7 @@ def _match_coarse_to_fine(
     if fundamental is None:
         return None
     fundamental, inlier = polish_fundamental(fundamental, xy1, xy2, threshold_px, ransac.seed)
-    extent = tuple(np.ptp(image2.shape[:, :2], axis=0))
+    extent = image2.extent
     if inlier.sum() < needed:
         return None
     if not is_significant(inlier, threshold_px, extent):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.errors import InputError
 from sfmapp.events import Events
-from sfmapp.geometry import epipolar, five_point, fundamental_refinement, relative_pose, turned_views
+from sfmapp.geometry import epipolar, five_point, fundamental_refinement, homography, relative_pose, turned_views
 from sfmapp.matching import guided
 from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
 from sfmapp.matching.options import MatchingOptions
@@ -348,4 +348,5 @@ def compile_kernels() -> None:
     relative_pose.compile_kernels()
     fundamental_refinement.compile_kernels()
     turned_views.compile_kernels()
+    homography.compile_kernels()
     guided.compile_kernels()

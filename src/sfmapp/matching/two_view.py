@@ -344,8 +344,8 @@ def _is_watermark(xy1: Array, xy2: Array, inlier: Mask, camera1: Camera, camera2
     in_border = inlier.copy()
     for xy, camera in ((xy1, camera1), (xy2, camera2)):
         border = _WATERMARK_BORDER_SHARE * math.hypot(camera.width, camera.height)
-        size = np.array([camera.width, camera.height])
-        in_border &= ((xy < border) | (xy > size - border)).any(1)
+        x, y = xy.T
+        in_border &= (x < border) | (x > camera.width - border) | (y < border) | (y > camera.height - border)
     num_inliers = inlier.sum()
     if in_border.sum() < _WATERMARK_MIN_SHARE * num_inliers:
         return False
