@@ -149,7 +149,9 @@ def markdown(report: dict[str, Any]) -> str:
         f"{report['date']}, {report['commit']}, {report['cpu']}. How: `benchmarks/carving_tolerance.py`.",
         "", "One silhouette in ten with a twentieth of its area gone or added: IoU with the hull of clean ones, "
         f"{SEEDS} draws each. A hole that reaches the outline, and takes nothing away that another silhouette lacks, "
-        "is the same to silhouettes as a notch: that of drawn 14 that was missed is one.",
+        "is the same to silhouettes as a notch: that of drawn 14 that was missed is one. A spill that covers what one "
+        "other alone sees through a gap is the same as a hole there: that of the house that was missed hides from the "
+        "only other photograph all of what it would carve behind a gap, which is filled then, and named.",
     ]  # fmt: skip
     for made_on, title in ((False, "Sets that chose nothing"), (True, "Sets that the rules were made on")):
         rows = [row for row in report["rows"] if row["made_on"] == made_on]
