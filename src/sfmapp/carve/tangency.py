@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sfmapp.carve.outlines import Silhouette, outline_pieces
 from sfmapp.carve.views import View
+from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
 
@@ -123,8 +123,8 @@ class Tangents:
         if hull is None:
             return None
         for _ in range(_STEPS):
-            rotation = Rotation.from_rotvec(turn)
-            miss, change = self._misses(i, hull.rays @ rotation.as_matrix().T)
+            rotation = rigid3.exp_so3(turn)
+            miss, change = self._misses(i, hull.rays @ rotation.T)
             miss, change = miss[kept].ravel(), change[kept].reshape(-1, 3)
             told = np.isfinite(miss)
             if np.count_nonzero(told) <= 3 or not change[told].any():
@@ -135,11 +135,11 @@ class Tangents:
             information = weighted.T @ change
             step = -np.linalg.lstsq(information, weighted.T @ miss, rcond=1e-9)[0]
             step *= min(1.0, _LARGEST_STEP / max(float(np.linalg.norm(step)), 1e-12))
-            turn = (Rotation.from_rotvec(step) * rotation).as_rotvec()
+            turn = rigid3.log_so3(rigid3.exp_so3(step) @ rotation)
             if np.linalg.norm(step) < 1e-6:
                 break
         angle = float(np.linalg.norm(turn))
-        after = np.abs(self._misses(i, hull.rays @ Rotation.from_rotvec(turn).as_matrix().T)[0][kept])
+        after = np.abs(self._misses(i, hull.rays @ rigid3.exp_so3(turn).T)[0][kept])
         before = np.abs(self.miss[i, kept])
         along = turn / max(angle, 1e-12)
         told_of = change.T @ change
