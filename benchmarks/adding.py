@@ -3,9 +3,10 @@
     python benchmarks/adding.py                          # sets with ground truth, several random orders each
     python benchmarks/adding.py --sets fountain-P11 --orders 5
 
-Each order is five batches: the first is reconstructed (three photographs or more; an order whose first batch is no
-model is told), the others are added with ``--add``. Errors are those of centres and rotations after a similarity, means
-over all photographs; CPU seconds those of all runs of an order together. ``late link``: two views of the courtyard that
+Each order is five batches: the first, photographs nearest to a random one (a fifth of all, five or more), is
+reconstructed, the others, at random, are added with ``--add``. Errors are those of centres and rotations after a
+similarity, means over all photographs; those of all at once are means of three seeds, beside the least and the largest.
+CPU seconds are those of all runs of an order together. ``late link``: two views of the courtyard that
 have no match with the first ones, and then those between.
 
 An output that is there already goes on from where it was.
@@ -29,12 +30,14 @@ from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import NoReconstructionError
 from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.formats.ground_truth import read_ground_truth
+from sfmapp.geometry import rigid3
 from sfmapp.pipelines.sparse.add import add_photographs
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
+from sfmapp.workspace.options import load_options
 from sparse import DATA
 
 SETS = ("fountain-P11", "herz-jesus-P8", "temple-sparse-ring", "strecha-courtyard-21", "lund-door", EXACT)
-NUM_BATCHES, LEAST = 5, 3
+NUM_BATCHES, LEAST, NUM_SEEDS = 5, 5, 3
 # views of the courtyard: of the fountain, two of the far end of the entry, and those between
 SIDES = (range(10, 15), (8, 9), (*range(8), *range(15, 21)))
 
@@ -44,12 +47,16 @@ def folder_of(name: str) -> Path:
     return ROOT / "data" / EXACT if name == EXACT else DATA / name
 
 
-def batches(names: Sequence[str], order: int) -> list[list[str]]:
-    """Five batches of photographs in a random order, the first of three or more."""
-    mixed = [names[i] for i in np.random.default_rng([order, 0xADD]).permutation(len(names))]
-    first = max(LEAST, len(mixed) // NUM_BATCHES)
-    rest = np.array_split(mixed[first:], NUM_BATCHES - 1)
-    return [mixed[:first], *(part.tolist() for part in rest if len(part))]
+def batches(name: str, order: int) -> list[list[str]]:
+    """Five batches of the photographs of a set in a random order."""
+    names = names_in(folder_of(name) / "images")
+    truth = read_ground_truth(folder_of(name) / "cameras.json").for_images(names)
+    rng, centers = np.random.default_rng([order, 0xADD]), rigid3.center(truth.cam_from_world)
+    near = np.argsort(np.linalg.norm(centers - centers[rng.integers(len(names))], axis=1), kind="stable")
+    first = near[: max(LEAST, len(names) // NUM_BATCHES)]
+    rest = rng.permutation(np.setdiff1d(np.arange(len(names)), first))
+    parts = [first, *np.array_split(rest, NUM_BATCHES - 1)]
+    return [[truth.names[i] for i in part] for part in parts if len(part)]
 
 
 def add_all(name: str, parts: Sequence[Sequence[str]], work: Path) -> list[RunResult]:
@@ -76,17 +83,27 @@ def errors(name: str, result: RunResult) -> dict[str, Any]:
     return {"registered": found.num_common, "center_share": center.mean, "rotation_deg": rotation.mean}
 
 
-def measure(name: str, order: int, whole: dict[str, Any], work: Path) -> dict[str, Any]:
+def measure(name: str, order: int, work: Path) -> dict[str, Any]:
     """One order of one set."""
-    names = names_in(folder_of(name) / "images")
-    row: dict[str, Any] = {"case": name, "order": order, "num": len(names), "all": whole}
+    row: dict[str, Any] = {"case": name, "order": order, "num": len(names_in(folder_of(name) / "images"))}
     try:
-        found = add_all(name, batches(names, order), work)
+        found = add_all(name, batches(name, order), work)
     except NoReconstructionError as error:
         return row | {"no_start": str(error)}
     moved = [one.report.added.moved_sigmas for one in found if one.report.added is not None]
     cpu = sum(one.report.run.cpu_s for one in found)
     return row | errors(name, found[-1]) | {"cpu_s": cpu, "moved_sigmas": moved}
+
+
+def measure_whole(name: str, work: Path) -> dict[str, Any]:
+    """All photographs at once, three seeds."""
+    runs = []
+    for seed in range(NUM_SEEDS):
+        found = reconstruct(
+            folder_of(name) / "images", work / str(seed), load_options([], [f"seed={seed}"]), record=False
+        )  # fmt: skip
+        runs.append(errors(name, found) | {"cpu_s": found.report.run.cpu_s})
+    return {"case": name, "runs": runs}
 
 
 def measure_late_link(work: Path) -> dict[str, Any]:
@@ -104,34 +121,38 @@ def measure_late_link(work: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def of_whole(report: dict[str, Any], name: str, what: str) -> list[float]:
+    """A figure of a set in all runs at once."""
+    return [float(run[what]) for row in report["whole"] if row["case"] == name for run in row["runs"]]
+
+
 def markdown(report: dict[str, Any]) -> str:
     """A row for each order."""
     lines = [f"sfmapp {report['versions']['sfmapp']} at {report['commit']}; {report['cpu']}, {report['date']}.", ""]
     lines += [
-        "| set | order | registered (all at once) | centres off, share of the size (all at once) | ratio "
-        "| rotations, degrees (all at once) | ratio | CPU s (all at once) |",
+        "| set | order | registered (all at once) | centres off, share of the size (all at once: mean, least, most) "
+        "| ratio | rotations, degrees (all at once) | ratio | CPU s (all at once) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in report["rows"]:
-        whole = row.get("all")
-        if whole is None:
-            continue
+        name, cells = row["case"], [row["case"], str(row["order"])]
         if "no_start" in row:
-            lines.append(f"| {row['case']} | {row['order']} | no model of the first batch | | | | | |")
+            lines.append(f"| {' | '.join(cells)} | no model of the first batch | | | | | |")
             continue
-        lines.append(
-            f"| {row['case']} | {row['order']} | {row['registered']} ({whole['registered']}) of {row['num']} "
-            f"| {row['center_share']:.2e} ({whole['center_share']:.2e}) "
-            f"| {row['center_share'] / whole['center_share']:.3f} "
-            f"| {row['rotation_deg']:.4f} ({whole['rotation_deg']:.4f}) "
-            f"| {row['rotation_deg'] / whole['rotation_deg']:.3f} | {row['cpu_s']:.0f} ({whole['cpu_s']:.0f}) |"
+        registered, center, rotation, cpu = (
+            of_whole(report, name, what) for what in ("registered", "center_share", "rotation_deg", "cpu_s")
         )
-    for row in report["rows"]:
-        if row["case"] == "late link":
-            sides = ", ".join(str(n) for n in row["registered"])
-            reasons = "; ".join(sorted({one["reason"] for one in row["left_over"] if one["model"] != 0}))
-            text = f"Late link: {sides} views in the largest model after each batch. Those of the second: {reasons}."
-            lines += ["", f"{text} Linked by the third: {len(row['linked'])}."]
+        lines.append(
+            f"| {' | '.join(cells)} | {row['registered']} ({min(registered):.0f}) of {row['num']} "
+            f"| {row['center_share']:.3e} ({np.mean(center):.3e}, {min(center):.3e} to {max(center):.3e}) "
+            f"| {row['center_share'] / np.mean(center):.3f} | {row['rotation_deg']:.4f} ({np.mean(rotation):.4f}) "
+            f"| {row['rotation_deg'] / np.mean(rotation):.3f} | {row['cpu_s']:.0f} ({np.mean(cpu):.0f}) |"
+        )
+    for row in report["late"]:
+        sides = ", ".join(str(n) for n in row["registered"])
+        reasons = "; ".join(sorted({one["reason"] for one in row["left_over"] if one["model"] != 0}))
+        text = f"Late link: {sides} views in the largest model after each batch. Those of the second: {reasons}."
+        lines += ["", f"{text} Linked by the third: {len(row['linked'])}."]
     return "\n".join(lines)
 
 
@@ -142,31 +163,26 @@ def main() -> None:
     parser.add_argument("--orders", type=int, default=3)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "adding.json")
     args = parser.parse_args()
-    report: dict[str, Any] = describe_machine() | {"rows": []}
+    report: dict[str, Any] = describe_machine() | {"whole": [], "rows": [], "late": []}
     if args.output.exists():
         report = json.loads(args.output.read_text(encoding="utf-8"))
-    rows = report["rows"]
 
-    def keep(row: dict[str, Any]) -> None:
-        rows.append(row)
+    def keep(part: str, row: dict[str, Any]) -> None:
+        report[part].append(row)
         print(json.dumps(row), file=sys.stderr, flush=True)
         args.output.write_text(json.dumps(report, indent=1) + "\n")
         args.output.with_suffix(".md").write_text(markdown(report) + "\n")
 
-    if not any(row["case"] == "late link" for row in rows):
-        with tempfile.TemporaryDirectory() as work:
-            keep(measure_late_link(Path(work)))
-    for name in args.sets:
-        done = [row for row in rows if row["case"] == name]
-        whole = done[0]["all"] if done else None
-        for order in range(args.orders):
-            if any(row["order"] == order for row in done):
-                continue
-            with tempfile.TemporaryDirectory() as work:
-                if whole is None:
-                    found = reconstruct(folder_of(name) / "images", Path(work) / "whole", record=False)
-                    whole = errors(name, found) | {"cpu_s": found.report.run.cpu_s}
-                keep(measure(name, order, whole, Path(work) / "parts"))
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        if not report["late"]:
+            keep("late", measure_late_link(work / "late"))
+        for name in args.sets:
+            if not any(row["case"] == name for row in report["whole"]):
+                keep("whole", measure_whole(name, work / f"{name} whole"))
+            done = [row["order"] for row in report["rows"] if row["case"] == name]
+            for order in set(range(args.orders)) - set(done):
+                keep("rows", measure(name, order, work / f"{name} {order}"))
     print(markdown(report))
 
 

@@ -45,6 +45,8 @@ Ints = NDArray[np.int64]
 STAGE = "locating"
 # Photographs of the model around a new one that its covariance is computed with: beyond, they say next to nothing.
 MAX_AROUND = 50
+# Other places that are looked at: of things that are there more often any one tells as much.
+_MAX_RIVALS = 3
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class Located:
         images: photographs of the model that it was matched with, most matches first, and num_matches of each.
         num_tried: photographs of the model that were compared with it.
         rms_px: of the residuals of the points that agree.
+        rivals: poses (7,) at which clearly weaker matches put it as well.
         told_focal: focal length by these points alone, if it were free, and its standard deviation, in pixels.
     """
 
@@ -90,6 +93,7 @@ class Located:
     num_matches: tuple[int, ...] = ()
     num_tried: int = 0
     rms_px: float = 0.0
+    rivals: tuple[Array, ...] = ()
     told_focal: tuple[float, float] | None = None
 
     def refused(self, reason: str) -> Located:
@@ -155,7 +159,8 @@ def locate_photograph(
     if isinstance(best, Registration):
         return replace(lost, reason=best.reason, num_correspondences=best.num_correspondences)
     lost = replace(lost, num_correspondences=best.registration.num_correspondences)
-    if reason := _rival(known, photograph, matches, best, options):
+    rivals = _rivals(known, photograph, matches, best, options)
+    if rivals and (reason := _as_strong(known, matches, best, rivals[0])):
         return replace(lost, reason=reason)
     is_new = np.arange(query + 1) == query
     num, visible, shared = missing_between(best.model, is_new, ~is_new, matches)
@@ -166,6 +171,7 @@ def locate_photograph(
             f"show, and shows {shared}: it looks alike there"
         )
         return replace(lost, reason=reason)
+    lost = replace(lost, rivals=tuple(rival.model.cam_from_world[query] for rival in rivals))
     return _adjusted(known, lost, best.model, options, events, pool)
 
 
@@ -286,25 +292,32 @@ def _limit_px(known: KnownModel, options: LocateOptions) -> float:
     return float(np.clip(mapping.max_reprojection_error_sigmas * scale, 1.0, mapping.max_reprojection_error_px))
 
 
-def _rival(
+def _rivals(
     known: KnownModel, photograph: NewPhotograph, matches: Correspondences, best: _Place, options: LocateOptions
-) -> str:
-    """Why a place is not believed although its points agree: another one that is not clearly weaker; empty if there is
-    none."""
-    if not len(best.against):
-        return ""
-    others = np.setdiff1d(np.arange(matches.num_pairs), best.against)
-    second = _place(known, photograph, matches.without(others), options)
-    if isinstance(second, Registration):
-        return ""
-    strengths = pair_strengths(best.model, matches)
-    there = float(strengths[best.against].max())
+) -> list[_Place]:
+    """Other places at which pairs that contradict the best one put a photograph, those of most points first."""
+    found: list[_Place] = []
+    left = best.against
+    while len(left) and len(found) < _MAX_RIVALS:
+        others = np.setdiff1d(np.arange(matches.num_pairs), left)
+        place = _place(known, photograph, matches.without(others), options)
+        if isinstance(place, Registration):
+            break
+        found.append(place)
+        left = np.intersect1d(left, place.against)
+    return found
+
+
+def _as_strong(known: KnownModel, matches: Correspondences, best: _Place, rival: _Place) -> str:
+    """Why a place is not believed although its points agree: what puts the photograph elsewhere is not clearly weaker;
+    empty if it is."""
+    there = float(pair_strengths(best.model, matches)[best.against].max())
     if best.strength >= CLEARLY * there:
         return ""
     names = known.model.image_names
     return (
         f"two places fit: {best.registration.num_inliers} points beside {names[best.nearest]} and "
-        f"{second.registration.num_inliers} beside {names[second.nearest]}, matched over {100 * best.strength:.0f} and "
+        f"{rival.registration.num_inliers} beside {names[rival.nearest]}, matched over {100 * best.strength:.0f} and "
         f"{100 * there:.0f} % of the picture"
     )
 

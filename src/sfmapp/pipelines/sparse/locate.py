@@ -175,8 +175,9 @@ def _locate_all(
         one, source = _locate(search, record, features[k], (found.camera_of(k), entry), tried)
         landmarks = None
         if one.is_located:
-            landmarks = _landmarks(search, record, one)
-            one = _doubted(one, landmarks)
+            landmarks = _landmarks(search, record, one.camera, one.cam_from_world)
+            rivals = [_landmarks(search, record, one.camera, pose) for pose in one.rivals]
+            one = _doubted(one, landmarks, rivals)
         located.append(one)
         rows.append(_row(search, one, source, same, landmarks, Usage(**watch.read())))
         events.advanced(STAGE, message=f"{record.name}: {rows[-1].text}")
@@ -211,10 +212,10 @@ def _is_other(told: tuple[float, float], focal: float) -> bool:
     return off > _FOCAL_SIGMAS * told[1] and off > _FOCAL_SHARE * focal
 
 
-def _landmarks(search: _Search, record: ImageRecord, found: Located) -> Score | None:
-    """What photographs of the model beside a photograph say of its place; None where they are gone."""
+def _landmarks(search: _Search, record: ImageRecord, lens: Camera, pose: NDArray[np.float64]) -> Score | None:
+    """What photographs of the model say of the place (7,) of a photograph from beside it; None where they are gone."""
     root, model = image_root(search.finished.manifest), search.finished.known.model
-    if root is None or found.camera.is_wide or any(camera.is_wide for camera in model.cameras):
+    if root is None or lens.is_wide or any(camera.is_wide for camera in model.cameras):
         return None
     shrunk = [_shrunk(camera) for camera in model.cameras]
     share = np.array([(s.width / c.width, s.height / c.height) for s, c in zip(shrunk, model.cameras, strict=True)])
@@ -226,8 +227,8 @@ def _landmarks(search: _Search, record: ImageRecord, found: Located) -> Score | 
         records, _ = describe_images(root, [model.image_names[image]], ImageOptions(), threads=1)
         return None if records[0] is None else _picture(records[0], shrunk[model.image_camera_idx[image]])
 
-    camera = _shrunk(found.camera)
-    return judge_place(small, found.cam_from_world, camera, _picture(record, camera), picture_of)
+    camera = _shrunk(lens)
+    return judge_place(small, pose, camera, _picture(record, camera), picture_of)
 
 
 def _shrunk(camera: Camera) -> Camera:
@@ -243,8 +244,12 @@ def _picture(record: ImageRecord, camera: Camera) -> NDArray[np.uint8]:
     return pixels if pixels.shape == size[::-1] else np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
 
 
-def _doubted(found: Located, landmarks: Score | None) -> Located:
-    """A located photograph, not located where its landmarks are missing, or do not speak for one place of several."""
+def _doubted(found: Located, landmarks: Score | None, rivals: Sequence[Score | None]) -> Located:
+    """A located photograph, not located where its landmarks are missing, or do not speak for one place of several.
+
+    At a place that clearly weaker matches put it at more has to be missing than here, as for a camera that is lost in a
+    known map (:mod:`sfmapp.odometry.belief.belief`).
+    """
     if landmarks is None:
         return found
     agreeing, told = len(found.track_idx), found.num_correspondences
@@ -253,6 +258,11 @@ def _doubted(found: Located, landmarks: Score | None) -> Located:
         return found.refused(
             f"where its matches put it, {landmarks.num_missing} of {landmarks.num_clusters} clusters of landmarks that "
             "photographs beside it show are not in it: it looks alike there"
+        )
+    if any(rival is not None and rival.num_missing <= landmarks.num_missing for rival in rivals):
+        return found.refused(
+            f"{agreeing} of {told} points agree with its pose, and others with a place that looks alike, where no more "
+            "landmarks are missing"
         )
     if 2 * agreeing < told and landmarks.support < -np.log(MAX_DOUBT):
         return found.refused(
