@@ -279,6 +279,36 @@ def locate_photographs(
     return pipeline(photographs, model, output, camera=camera, events=events)
 
 
+def merge(
+    first: FilePath, second: FilePath, output: FilePath, *, record: bool = True, events: Events | None = None
+) -> RunResult:
+    """Make one reconstruction of two that share photographs, or see the same place. Neither of them is changed.
+
+    Args:
+        first, second: their folders. Options, and what places the model in the world, are those of the first.
+        output: a new folder, an empty one, or that of an earlier call.
+        record: write ``recording.rrd``, which replays the run.
+        events: told of everything that happens, and can ask the run to stop.
+
+    Returns:
+        The largest model as it is read back from ``sparse/0``, and the report, whose ``merged`` says how far apart the
+        two were.
+
+    Raises:
+        UsageError: the output holds something else.
+        InputError: one of them is no finished reconstruction, or its photographs are gone or have changed.
+        NoReconstructionError: they do not agree, or have nothing in common.
+        InterruptedRunError: ``events`` was asked to stop; the same call goes on.
+
+    Example:
+        >>> reconstruction, report = sfmapp.merge("monday/", "tuesday/", "both/")
+    """
+    from sfmapp.pipelines.sparse.merge import merge_reconstructions
+
+    found, report = merge_reconstructions(first, second, output, events=events, record=record)
+    return RunResult(Reconstruction.of(found), report)
+
+
 def densify(
     source: FilePath,
     output: FilePath | None = None,

@@ -151,9 +151,9 @@ def _reconstruct(args: argparse.Namespace) -> int:
         args.set.append("surface.texture=true")
     options = _options(args)
     report = _run(args, args.images, options)
-    result = _result(args.output, report)
+    result = reconstruction_result(args.output, report)
     if not args.json and not args.quiet:
-        _print_summary(args.output, report)
+        print_summary(args.output, report)
     if args.dense or args.mesh:
         result |= _go_on(args, options)
     if args.json:
@@ -192,10 +192,10 @@ def _demo(args: argparse.Namespace) -> int:
     report = _run(args, str(sample / "images"), options)
     errors = compare_with_ground_truth(args.output, sample)
     if args.json:
-        print_json({"exit_code": 0, **_result(args.output, report), "ground_truth": errors})
+        print_json({"exit_code": 0, **reconstruction_result(args.output, report), "ground_truth": errors})
         return 0
     if not args.quiet:
-        _print_summary(args.output, report)
+        print_summary(args.output, report)
     center, rotation = errors.center_error, errors.rotation_error_deg
     assert center is not None
     assert rotation is not None
@@ -220,7 +220,7 @@ def _run(args: argparse.Namespace, images: str, options: Options) -> Reconstruct
     return result.report
 
 
-def _result(output: Path, report: ReconstructionReport) -> dict[str, object]:
+def reconstruction_result(output: Path, report: ReconstructionReport) -> dict[str, object]:
     """What ``--json`` prints: the outcome in numbers; the rest is in report.json."""
     missing = [image.name for image in report.images if not image.is_registered]
     paths = {"model": str(output / "sparse" / "0"), "report": str(output / "report.json")}
@@ -318,12 +318,15 @@ def _print_units(report: ReconstructionReport) -> None:
         print(f"  model {level.model}: {text}")
 
 
-def _print_summary(output: Path, report: ReconstructionReport) -> None:
+def print_summary(output: Path, report: ReconstructionReport) -> None:
+    """What came of a reconstruction, in words."""
     model, run = report.models[0], report.run
     print(
         f"{model.num_registered} of {model.num_images} images registered, {model.num_points} points,"
         f" tracks of {model.mean_track_length:.2f}, reprojection error {model.mean_reprojection_error_px:.2f} px"
     )
+    if report.merged is not None:
+        print(f"  {report.merged.text}")
     if report.added is not None:
         print(f"  {report.added.text}")
         for one in report.added.known:

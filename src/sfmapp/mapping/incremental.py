@@ -61,10 +61,12 @@ class Ends:
     Attributes:
         start: finished models of some of the images, known by their names, that mapping goes on with. Where the
             photographs turn out not to believe a focal length, or which parts are one, it begins anew.
+        is_apart: images of one of them come to another with it, by the similarity between them, and not one by one.
         closing: called in the end with the finished models, the largest first, to move and adjust them further.
     """
 
     start: Sequence[Reconstruction] = ()
+    is_apart: bool = False
     closing: Callable[[list[Mapper]], None] | None = None
 
 
@@ -115,7 +117,7 @@ def map_images(
         def map_all(given: list[Camera]) -> Mapped:
             return task.map_from(given, correspondences, tracks)
 
-        first_map = task.map_from(list(image_set.cameras), correspondences, tracks, ends.start)
+        first_map = task.map_from(list(image_set.cameras), correspondences, tracks, ends)
         mapped = settle_focal_lengths(first_map, map_all, events)
 
         def map_again(found: Correspondences) -> Mapped:
@@ -169,7 +171,7 @@ class _Task:
 
     def map_from(
         self, given: list[Camera], correspondences: Correspondences, tracks: Tracks,
-        start: Sequence[Reconstruction] = (),
+        ends: Ends | None = None,
     ) -> Mapped:  # fmt: skip
         """Models that begin with the given cameras, from verified matches and their tracks, or with finished ones."""
         names, options, events = self.names, self.options, self.events
@@ -186,8 +188,9 @@ class _Task:
             )  # fmt: skip
 
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
-        begun = [carried(model, empty) for model in start]
-        models, initial_reports = _grow_models(empty, mapper_of, options, events, begun)
+        begun = [carried(model, empty) for model in ends.start] if ends is not None else []
+        is_apart = ends is not None and ends.is_apart
+        models, initial_reports = _grow_models(empty, mapper_of, options, events, begun, is_apart=is_apart)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
         models = [repaired(model, correspondences, mapper_of, options, events) for model in models]
@@ -210,10 +213,10 @@ def _model_report(
 
 def _grow_models(
     empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events,
-    begun: Sequence[Reconstruction] = (),
+    begun: Sequence[Reconstruction] = (), *, is_apart: bool = False,
 ) -> tuple[list[Reconstruction], list[StartReport]]:  # fmt: skip
     """One model after another, each begun from images that no earlier one holds, and the initial pairs tried; before
-    these such as were finished earlier go on.
+    these such as were finished earlier go on, which leave each other's images alone where they are to stay apart.
 
     A model may grow into images of earlier, smaller ones: it may see more of the points that they need. But one that
     holds most of the images is not handed over to what it refused itself, as repeated structure would have it.
@@ -223,7 +226,8 @@ def _grow_models(
     seeds = np.ones(len(empty.image_names), bool)
     locked = np.zeros(len(seeds), bool)
     for taken_up in begun:
-        mapper = mapper_of(taken_up, locked)
+        others = [other.is_registered & ~taken_up.is_registered for other in begun if is_apart]
+        mapper = mapper_of(taken_up, np.any([locked, *others], axis=0))
         mapper.take_up()
         events.advanced(STAGE, int(taken_up.is_registered.sum()))
         mapper.grow()

@@ -74,6 +74,8 @@ def render_html(
         body.append(f'<h2>From above</h2>{view}<p class="dim">{note}</p>')
     if report.added is not None:
         body.append(added_section(report.added))
+    if report.merged is not None and not report.outcome.exit_code:
+        body.append(f"<h2>Merged</h2><p>{escape(report.merged.text)}.</p>")
     placed = report.stages.georeference
     if placed is not None:
         is_in_world = any(one.model == 0 and not one.reason for one in placed.models)

@@ -325,6 +325,33 @@ class AddedReport(Report):
         return text
 
 
+class MergedReport(Report):
+    """Two reconstructions that were made one.
+
+    Attributes:
+        first, second: their folders. num_images: photographs in the model of each. num_shared: in both.
+        off_sigmas: how far the shared ones are apart once one model is moved onto the other, rms, in the standard
+            deviations of both; absent where these are not known, or too few are shared.
+    """
+
+    first: str
+    second: str
+    num_images: Sequence[int]
+    num_shared: int
+    off_sigmas: float | None = None
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        text = f"{self.first} ({self.num_images[0]} photographs) and {self.second} ({self.num_images[1]}) are one model"
+        if self.off_sigmas is None:
+            return f"{text}; {self.num_shared} photographs were in both"
+        return (
+            f"{text}; {self.num_shared} photographs were in both, {self.off_sigmas:.1f} standard deviations apart once "
+            "one was moved onto the other"
+        )
+
+
 class ReconstructionReport(Report):
     """The report of ``sfmapp reconstruct``.
 
@@ -349,6 +376,7 @@ class ReconstructionReport(Report):
     decisions: Sequence[LogLine]
     stages: Stages
     added: AddedReport | None = None
+    merged: MergedReport | None = None
     dense: DensePart | None = None
 
 

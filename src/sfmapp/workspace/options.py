@@ -361,3 +361,15 @@ def _type_name(annotation: Any) -> str:
     if isinstance(annotation, type) and issubclass(annotation, enum.Enum):
         return "|".join(annotation.__members__)
     return getattr(annotation, "__name__", str(annotation))
+
+
+def flat_options(options: Options) -> dict[str, Any]:
+    """Plain values by the names that options have on the command line."""
+    return _flat(options_to_dict(options), "")
+
+
+def _flat(values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return out

@@ -11,14 +11,13 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
-from sfmapp.formats.colmap import has_model, read_model
+from sfmapp.formats.colmap import read_model
 from sfmapp.formats.database import Database
 from sfmapp.georeference.sources import with_positions
 from sfmapp.georeference.world_frame import GEOREFERENCE
@@ -28,25 +27,32 @@ from sfmapp.images.report import ImagesReport
 from sfmapp.images.sources import Found
 from sfmapp.mapping.closing_move import closing_move
 from sfmapp.mapping.report import Uncertainty
-from sfmapp.pipelines.sparse.finished import DATABASE, read_report
+from sfmapp.pipelines.sparse.finished import (
+    DATABASE,
+    check_finished,
+    models_of,
+    names_in_database,
+    read_report,
+    uncertainty_of,
+)
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
+from sfmapp.pipelines.sparse.photographs import PHOTOGRAPHS, as_before, link_photographs, with_new
 from sfmapp.pipelines.sparse.reconstruct import RunResult, check_enough, map_and_report
 from sfmapp.pipelines.sparse.run import Before, Run
 from sfmapp.pipelines.sparse.world import read_control, read_known_poses
-from sfmapp.pipelines.stored_pixels import check_pixels
 from sfmapp.report.model import AddedPhotograph, AddedReport, ReconstructionReport
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.layout import MANIFEST, PAGE, RECONSTRUCT, REPORT
 from sfmapp.workspace.manifest import Manifest, image_root, missing_photographs, read_manifest
-from sfmapp.workspace.options import Options, options_from_dict, options_to_dict, with_absolute_paths
+from sfmapp.workspace.options import Options, flat_options, options_from_dict, with_absolute_paths
 from sfmapp.workspace.usage import Stopwatch
 from sfmapp.workspace.workspace import open_workspace
 
-# Where the new state is made, in OUT; what says in it that it is whole; and the photographs of several folders as one.
-_BESIDE, _READY, _PHOTOGRAPHS = ".adding", "ready", "photographs"
+# Where the new state is made, in OUT, and what says in it that it is whole.
+_BESIDE, _READY = ".adding", "ready"
 # In the order in which they take the place of the old ones: the manifest last.
 _RESULTS = (DATABASE, "sparse", "recording.rrd", GEOREFERENCE, "log.jsonl", PAGE, REPORT, MANIFEST)
 # Options that decide no result, and may be others than at first.
@@ -102,11 +108,11 @@ def add_photographs(
         _put_in_place(folder)
         manifest = read_manifest(folder, RECONSTRUCT)
         first = options_from_dict(manifest.options)
-        _check_finished(folder, manifest)
+        check_finished(folder, manifest)
         if options is not None:
             _check_options(with_absolute_paths(options), first)
             first = replace(first, threads=options.threads, min_registered=options.min_registered)
-        old_names = _old_names(folder)
+        old_names = names_in_database(folder)
         new = _new_photographs(images, folder, manifest, old_names, first, events)
         for name, reason in new.known:
             events.warned("images", f"{name}: {reason}")
@@ -130,7 +136,7 @@ def _run(
     run: Run, folder: Path, manifest: Manifest, new: _New, old_names: Sequence[str]
 ) -> ReconstructionReport:  # fmt: skip
     """The job, in its own workspace."""
-    before, uncertainty = _models(folder), _uncertainty(folder)
+    before, uncertainty = models_of(folder), uncertainty_of(folder)
     with run.stage("images"):
         image_set, images, of_before = _all_photographs(run, folder, manifest, new, old_names)
         run.image_set = with_positions(image_set, run.options.gps)
@@ -163,19 +169,9 @@ def _run(
 # ------------------------------------------------------------------------------------------------------ what is there
 
 
-def _check_finished(folder: Path, manifest: Manifest) -> None:
-    stage = manifest.stage("mapping")
-    if not stage.is_done or not has_model(folder / "sparse" / "0") or not (folder / DATABASE).is_file():
-        raise InputError(
-            f"{folder}: expected a finished reconstruction with its database, found none",
-            f"run sfmapp reconstruct {manifest.source or 'PHOTOS'} -o {folder} to its end first",
-        )
-    check_pixels(folder, manifest)
-
-
 def _check_options(given: Options, first: Options) -> None:
     """Raises UsageError if options were asked for that differ from those of the first run."""
-    told, known, plain = (_flat(options_to_dict(one)) for one in (given, first, Options()))
+    told, known, plain = (flat_options(one) for one in (given, first, Options()))
     others = [
         f"{name} = {told[name]} (it was made with {known.get(name)})"
         for name in told
@@ -186,33 +182,6 @@ def _check_options(given: Options, first: Options) -> None:
             f"options that differ from those of the reconstruction: {'; '.join(others)}",
             "nothing was touched; leave them out, or reconstruct all photographs into another OUT",
         )
-
-
-def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
-    """Values by the names that options have on the command line."""
-    out: dict[str, Any] = {}
-    for name, value in values.items():
-        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return out
-
-
-def _old_names(folder: Path) -> list[str]:
-    with Database(folder / DATABASE, read_only=True) as database:
-        return database.read_images()[1]
-
-
-def _models(folder: Path) -> list[Reconstruction]:
-    """All models, the largest first."""
-    found: list[Reconstruction] = []
-    while has_model(folder / "sparse" / str(len(found))):
-        found.append(read_model(folder / "sparse" / str(len(found)))[0])
-    return found
-
-
-def _uncertainty(folder: Path) -> Uncertainty:
-    report = read_report(folder)
-    mapping = None if report is None else report.stages.mapping
-    return mapping.models[0].uncertainty if mapping is not None and mapping.models else Uncertainty()
 
 
 def _nothing_new(folder: Path, watch: Stopwatch) -> RunResult:
@@ -254,30 +223,11 @@ def _new_photographs(
             taken.add(name)
             of_digest[record.digest] = name
     if outside:
-        links = (folder / _PHOTOGRAPHS).absolute()
-        _link(links, {name: root / name for name in (*old_names, *inside)} if links != root else {})
-        _link(links, outside)
+        links = (folder / PHOTOGRAPHS).absolute()
+        link_photographs(links, {name: root / name for name in (*old_names, *inside)} if links != root else {})
+        link_photographs(links, outside)
         root = links
     return _New(root, (*inside, *outside), os.path.abspath(images), tuple(known))
-
-
-def _link(folder: Path, files: dict[str, Path]) -> None:
-    """Put links to files into a folder, so that names in several folders are those in one.
-
-    Raises:
-        InputError: the system has no links, or something else is there.
-    """
-    for name, path in files.items():
-        link = folder / name
-        try:
-            link.parent.mkdir(parents=True, exist_ok=True)
-            if not link.is_symlink():
-                link.symlink_to(path.resolve())
-        except OSError as error:
-            raise InputError(
-                f"{link}: expected to put a link to {path} there: {error.strerror}",
-                "move all photographs into one folder, and add those",
-            ) from error
 
 
 def _all_photographs(
@@ -298,30 +248,13 @@ def _all_photographs(
                 f"{new.root / name}: expected a photograph of the reconstruction as it was, which {what}",
                 "bring it back, or reconstruct anew into another OUT",
             )
-    with Database(folder / DATABASE, read_only=True) as database:
-        old_cameras, _, old_idx = database.read_images()
-    added = [name for name in new.names if name in records]
-    whose = {int(records[name].camera_idx): int(c) for name, c in zip(old_names, old_idx, strict=True)}
-    shared = {u for u in whose if len({int(c) for n, c in zip(old_names, old_idx, strict=True)
-              if records[n].camera_idx == u}) == 1}  # fmt: skip
-    # what is known of them beforehand is in no database
-    first = {int(c): found.cameras[records[name].camera_idx] for name, c in zip(old_names, old_idx, strict=True)}
-    cameras = [
-        replace(camera, focal_sigma=first[c].focal_sigma, focal_source=first[c].focal_source,
-                is_fixed=first[c].is_fixed, prior_covariance=first[c].prior_covariance)
-        if c in first else camera
-        for c, camera in enumerate(old_cameras)
-    ]  # fmt: skip
-    images = [replace(records[name], camera_idx=int(c)) for name, c in zip(old_names, old_idx, strict=True)]
-    before = ImageSet(tuple(images), tuple(cameras), root=new.root)
-    of_union: dict[int, int] = {u: whose[u] for u in shared}
-    for name in added:
-        union = records[name].camera_idx
-        if union not in of_union:
-            of_union[union] = len(cameras)
-            cameras.append(found.cameras[union])
-        images.append(replace(records[name], camera_idx=of_union[union]))
-    return ImageSet(tuple(images), tuple(cameras), found.skipped, new.root), report, before
+    own = [records[name] for name in old_names]
+    before = as_before(folder / DATABASE, old_names, own, found.cameras)
+    added = [records[name] for name in new.names if name in records]
+    union = with_new(
+        before, [record.camera_idx for record in own], [(one, found.cameras[one.camera_idx]) for one in added]
+    )  # fmt: skip
+    return replace(union, skipped=found.skipped, root=new.root), report, before
 
 
 def _with_new_key(

@@ -14,10 +14,12 @@ from sfmapp.formats.colmap import has_model, read_model
 from sfmapp.formats.database import Database
 from sfmapp.images.report import CameraPrior
 from sfmapp.mapping.attach import KnownModel
+from sfmapp.mapping.report import Uncertainty
 from sfmapp.pipelines.stored_pixels import check_pixels
 from sfmapp.report.model import ReconstructionReport
 from sfmapp.reporting import from_plain
 from sfmapp.scene.features import Features
+from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.workspace.layout import RECONSTRUCT, REPORT
 from sfmapp.workspace.manifest import Manifest, read_json, read_manifest
 from sfmapp.workspace.options import Options, options_from_dict
@@ -142,3 +144,35 @@ def _is_same(known: CameraPrior, entry: CameraPrior) -> bool:
     if "default" in (known.focal_source, entry.focal_source) or known.focal_source == "user":
         return known.focal_source in ("user", entry.focal_source)
     return abs(known.focal_px - entry.focal_px) <= _SAME_FOCAL * entry.focal_px
+
+
+def check_finished(folder: Path, manifest: Manifest) -> None:
+    """Raise InputError if a folder holds no reconstruction that has come to its end."""
+    stage = manifest.stage("mapping")
+    if not stage.is_done or not has_model(folder / "sparse" / "0") or not (folder / DATABASE).is_file():
+        raise InputError(
+            f"{folder}: expected a finished reconstruction with its database, found none",
+            f"run sfmapp reconstruct {manifest.source or 'PHOTOS'} -o {folder} to its end first",
+        )
+    check_pixels(folder, manifest)
+
+
+def names_in_database(folder: Path) -> list[str]:
+    """The photographs of a reconstruction, in the order of its database."""
+    with Database(folder / DATABASE, read_only=True) as database:
+        return database.read_images()[1]
+
+
+def models_of(folder: Path) -> list[Reconstruction]:
+    """All models, the largest first."""
+    found: list[Reconstruction] = []
+    while has_model(folder / "sparse" / str(len(found))):
+        found.append(read_model(folder / "sparse" / str(len(found)))[0])
+    return found
+
+
+def uncertainty_of(folder: Path) -> Uncertainty:
+    """How sure the largest model of a reconstruction is, by its report; empty where that is gone."""
+    report = read_report(folder)
+    mapping = None if report is None else report.stages.mapping
+    return mapping.models[0].uncertainty if mapping is not None and mapping.models else Uncertainty()

@@ -145,12 +145,14 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
                 poses=held_poses(run, run.poses, image_set),
             )
         else:
-            start = run.before.models if run.before is not None else ()
+            start, is_apart = (run.before.models, run.before.is_apart) if run.before is not None else ([], False)
             models, mapped = map_images(
                 *given, adjust_options=options.adjust, threads=threads, events=events,
-                ends=Ends(start, closing(run, image_set)),
+                ends=Ends(start, is_apart, closing(run, image_set)),
             )  # fmt: skip
         run.stages = replace(run.stages, mapping=mapped)
+    if run.judge is not None:
+        run.judge(models)
     return models
 
 

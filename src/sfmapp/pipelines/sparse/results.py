@@ -81,6 +81,7 @@ def write_results(
     report = _make_report(run, models, failure)
     if run.added is not None:
         report = replace(report, added=run.added(models))
+    report = replace(report, merged=run.merged)
     page = render_html(report, models[0] if models else None)
     run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()  # the last measurement that can still be written down
@@ -120,7 +121,7 @@ def _make_report(
     run: Run, models: Sequence[Reconstruction], failure: NoReconstructionError | None
 ) -> ReconstructionReport:
     assert run.image_set is not None
-    mapped = run.stages.mapping.models if run.stages.mapping is not None else []
+    mapped = run.stages.mapping.models if run.stages.mapping is not None and models else []
     entries = [
         ModelEntry(**model.summary(), contradictions=row.contradictions, apart=row.apart)
         for model, row in zip(models, mapped, strict=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.images.load import Images
-from sfmapp.report.model import AddedReport, Stages
+from sfmapp.report.model import AddedReport, MergedReport, Stages
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
 
@@ -33,11 +33,13 @@ class Before:
         num_images: photographs, which come first.
         pairs: (P, 2) int32 of them that were compared, i < j, sorted.
         models: finished, the largest first.
+        is_apart: photographs of one model come to another with it, and not one by one.
     """
 
     num_images: int
     pairs: NDArray[np.int32]
     models: list[Reconstruction]
+    is_apart: bool = False
 
 
 @dataclass(kw_only=True)
@@ -53,6 +55,8 @@ class Run(Job):
         georeference: where models lie in the world; None where they do not.
         before: what photographs are added to; None where they are all new.
         added: tells what came of those by the models.
+        merged: tells the same of a reconstruction that was joined to another one.
+        judge: raises NoReconstructionError where the models are not what they should be.
     """
 
     images: Images
@@ -67,3 +71,5 @@ class Run(Job):
     georeference: Georeference | None = None
     before: Before | None = None
     added: Callable[[Sequence[Reconstruction]], AddedReport] | None = None
+    merged: MergedReport | None = None
+    judge: Callable[[Sequence[Reconstruction]], None] | None = None
