@@ -198,3 +198,12 @@ def test_memory_estimate_covers_what_is_taken() -> None:
 def test_impossible_options_name_the_field(wrong: dict[str, object]) -> None:
     with pytest.raises(UsageError, match=f"features.{next(iter(wrong))}"):
         FeatureOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_keypoints_stay_without_descriptors() -> None:
+    features = features_from_picture(picture_of(texture((200, 150))), FeatureOptions(max_num_features=100))[0]
+    alone = features.without_descriptors()
+    assert alone.descriptors.shape == (100, 0)
+    assert alone.descriptors.base is None  # which would hold them all
+    np.testing.assert_array_equal(alone.keypoints, features.keypoints)
+    np.testing.assert_array_equal(alone.rgb, features.rgb)

@@ -207,8 +207,8 @@ def _fill_rows(t: int, seen: _Seen, cameras: _Cameras, unknowns: _Unknowns, nois
         i = obs_image[o]
         s = i % num_sensors
         linearize(
-            offset(pose, 12 * i), False, offset(pose, 0), offset(lens, ROW * s), (xyz[t, 0], xyz[t, 1], xyz[t, 2]),
-            (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[s], True, scratch,
+            offset(pose, 12 * i), np.bool_(False), offset(pose, 0), offset(lens, ROW * s),
+            (xyz[t, 0], xyz[t, 1], xyz[t, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[s], np.bool_(True), scratch,
         )  # fmt: skip
         used = 8 if canonical[s, FAMILY] <= LAST_ON_PLANE else FAMILY  # the numbers in the row that mean something
         frames[n] = i // num_sensors

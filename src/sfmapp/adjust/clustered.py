@@ -125,7 +125,8 @@ def _add_tracks(
             c = image_camera[i]
             s = linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c],
+                np.bool_(False), scratch,
             )  # fmt: skip
             squared = J[POINT + 3] * J[POINT + 3] + J[POINT + 11] * J[POINT + 11]
             weight = squared / s if s > 0.0 else 1.0
@@ -166,3 +167,11 @@ def _add_tracks(
                         meet = Z[k, r, 0] * Z[q, m, 0] + Z[k, r, 1] * Z[q, m, 1] + Z[k, r, 2] * Z[q, m, 2]
                         clustered[6 * k + r, 6 * q + m] += g[k, r] * g[q, m]
                         independent[6 * k + r, 6 * q + m] -= noise * meet
+
+
+def compile_kernels() -> None:
+    """Compile the kernels of this module, or load them from numba's cache."""
+    from sfmapp.scene.synthetic import make_scene
+
+    fixed = AdjustOptions(refine_focal=False, refine_distortion=False)
+    clustered_covariances(make_scene(0, 3, 40).observed, fixed)

@@ -509,7 +509,8 @@ def _point_covariances(
             c = image_camera[i]
             linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], True, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c],
+                np.bool_(True), scratch,
             )  # fmt: skip
             for block in (image_block[i], camera_block[c], second_block[c]):
                 if block >= 0 and mark[block] != p:

@@ -220,15 +220,16 @@ def _linearize_ray(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def linearize(
-    pose: Pointer, mounted: bool, mount: Pointer, c: Pointer, point: tuple[float, float, float],
-    pixel: tuple[float, float], loss: RobustLoss, penalty: float, intrinsics: bool, J: Pointer,
+    pose: Pointer, mounted: bool | np.bool_, mount: Pointer, c: Pointer, point: tuple[float, float, float],
+    pixel: tuple[float, float], loss: RobustLoss, penalty: float, intrinsics: bool | np.bool_, J: Pointer,
 ) -> float:  # fmt: skip
     """Weighted Jacobians and residual of one observation into the scratch row J; returns the squared residual.
 
     pose, mount, c and J are pointers: to 12 numbers, R row by row and t, of cam_from_world and, if ``mounted``, of
     cam_from_rig, the derivatives then being those by the rig's pose; to the camera's canonical row, whose
     derivatives are wanted if ``intrinsics``; and to the scratch row. Behind the camera the Jacobians are zero and the
-    squared residual is ``penalty``, so that a point gains nothing by slipping there.
+    squared residual is ``penalty``, so that a point gains nothing by slipping there. Callers hand over constants as
+    ``np.bool_(True)``: for literals numba compiles it anew.
     """
     x0, x1, x2 = point
     xo, yo = pixel
@@ -590,7 +591,8 @@ def weigh_observations(
             c = image_camera[i]
             s = linearize(
                 offset(pose, 12 * i), image_mount[i] >= 0, offset(mount, 12 * image_mount[i]), offset(lens, ROW * c),
-                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c], False, scratch,
+                (xyz[p, 0], xyz[p, 1], xyz[p, 2]), (obs_xy[o, 0], obs_xy[o, 1]), loss, penalty[c],
+                np.bool_(False), scratch,
             )  # fmt: skip
             weight = robust_weight(loss, s)
             if weight < least:

@@ -111,7 +111,7 @@ def _normal_equations(
     total, product = 0.0, 1.0
     for n in range(xyz.shape[0]):
         s2 = linearize(
-            pointer(rows), False, pointer(rows), pointer(canonical), (xyz[n, 0], xyz[n, 1], xyz[n, 2]),
+            pointer(rows), np.bool_(False), pointer(rows), pointer(canonical), (xyz[n, 0], xyz[n, 1], xyz[n, 2]),
             (xy[n, 0], xy[n, 1]), loss, -1.0, size > 6, pointer(J),
         )  # fmt: skip
         residuals2[n] = s2

@@ -125,7 +125,7 @@ def _offer(
     start, columns, rows = images.cell_start[m], np.int64(images.columns[m]), np.int64(images.rows[m])
     g = start + y * columns + x
     there = cells.patch[LAYERS * g]
-    count = 0
+    count: Any = np.int64(0)
     for ny in range(max(y - 1, 0), min(y + 2, rows)):
         for nx in range(max(x - 1, 0), min(x + 2, columns)):
             if nx == x and ny == y:

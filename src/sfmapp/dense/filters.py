@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba import float32 as f32
@@ -47,7 +49,7 @@ def refill(
 def compact(store: Store, kept: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Move the patches that are ``kept`` (N,) bool to the front; (N,) int32 their new positions, -1 for the others."""
     new_idx = np.full(kept.shape[0], -1, np.int32)
-    count = 0
+    count: Any = np.int64(0)
     for p in range(kept.shape[0]):
         if kept[p]:
             if p != count:

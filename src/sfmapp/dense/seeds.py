@@ -7,7 +7,7 @@ has a corner as well. Places that correlate there and in a second image are refi
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -135,7 +135,7 @@ def _refine_best(
         if depths[j] <= f32(0.0):
             break
         plane[0], plane[1], plane[2] = depths[j], f32(0.0), f32(0.0)
-        n = 0
+        n: Any = np.int64(0)  # a literal would have refine and judge compiled twice
         for slot in range(images.num_slots):
             if images.neighbors[m * images.num_slots + slot] >= 0 and n < limits.max_refined:
                 slots[n] = slot

@@ -6,6 +6,7 @@ Pixels are those of an octave, with the centre of the top-left one at (0, 0), as
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -65,7 +66,10 @@ def _find_peaks(hist: NDArray[np.float64], max_num: int, out: NDArray[np.float64
         for b in range(num):
             target[b] = (source[b - 1] + source[b] + source[b + 1 if b + 1 < num else 0]) / 3.0
     smooth = hist[0]
-    limit = _PEAK_RATIO * smooth.max()
+    most = smooth[0]
+    for b in range(1, num):
+        most = max(most, smooth[b])
+    limit = _PEAK_RATIO * most
     found = 0
     for _ in range(max_num):
         best, best_b = 0.0, -1
@@ -109,7 +113,7 @@ def find_orientations(
     radius = int(3.0 * window)
     scale = np.float32(_EXP_SIZE / (_EXP_MAX * 2.0 * window * window))
     xi, yi = round(x), round(y)
-    num_samples = 0
+    num_samples: Any = np.int64(0)  # a literal would have _polar compiled twice
     for r in range(max(1, yi - radius), min(height - 1, yi + radius + 1), STRIDE):
         dy = np.float32(r - y)
         before, row, after = level[r - 1], level[r], level[r + 1]

@@ -112,8 +112,9 @@ def poses_of_three(xyz: Array, rays: Array, rotations: Array, translations: Arra
     )  # fmt: skip
     quartic[3] = 4.0 * (-d * (1.0 + d) * cos_b + 2.0 * a2 / b2 * cos_c**2 * cos_b - (1.0 - e) * cos_a * cos_c)
     quartic[4] = (1.0 + d) ** 2 - 4.0 * a2 / b2 * cos_c**2
-    if not abs(quartic[0]) > 1e-14 * np.abs(quartic).max():
-        return 0
+    for k in range(5):
+        if not abs(quartic[0]) > 1e-14 * abs(quartic[k]):
+            return 0
     companion = np.zeros((4, 4), np.complex128)
     for k in range(4):
         companion[0, k] = -quartic[k + 1] / quartic[0]

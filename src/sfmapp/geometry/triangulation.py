@@ -9,7 +9,7 @@ reweighted by depth: for the small residuals that are left this is the reproject
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -304,7 +304,7 @@ def classify_observations(
     for t in tracks:
         if math.isnan(point_xyz[t, 0]):
             continue
-        k = 0
+        k: Any = np.int64(0)
         inliers = 0
         for o in range(track_ptr[t], track_ptr[t + 1]):
             i = obs_image_idx[o]

@@ -19,16 +19,21 @@ USELESS_CONFIGS = (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE, TwoViewCon
 
 @numba.njit(cache=True, nogil=True)
 def _join(
-    first: NDArray[np.int64], second: NDArray[np.int64], image: NDArray[np.int32], parent: NDArray[np.int64]
-) -> int:
+    first: NDArray[np.int64], second: NDArray[np.int64], image: NDArray[np.int32], stamp: NDArray[np.int64],
+    parent: NDArray[np.int64], following: NDArray[np.int64],
+) -> int:  # fmt: skip
     """Unite the keypoints of each match in the given order; a union that would hold an image twice is refused.
 
     Components are circular lists as well, so that walking the smaller one costs its length. Returns the refusals.
+
+    Args:
+        first, second: (M,) nodes of each match; image: (N,) of each node; stamp: a -1 for each image.
+        parent, following: (N,) each node itself; parent ends as the root of each.
     """
     n = image.shape[0]
-    following = np.arange(n)
-    size = np.ones(n, np.int64)
-    stamp = np.full(image.max() + 1 if n else 1, -1, np.int64)
+    size = np.empty(n, np.int64)
+    for i in range(n):
+        size[i] = 1
     refused = 0
     for m in range(first.shape[0]):
         a, b = first[m], second[m]
@@ -92,7 +97,9 @@ def build_tracks(correspondences: Correspondences, features: Sequence[Features])
         + [correspondences.matches_of_pair(int(p)) + offset[correspondences.pair_image_idx[p]][None, :] for p in pairs]
     )
     parent = np.arange(len(image_of_node))
-    refused = _join(np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1]), image_of_node, parent)
+    stamp, following = np.full(len(features), -1), parent.copy()
+    first, second = np.ascontiguousarray(edges.T)
+    refused = _join(first, second, image_of_node, stamp, parent, following)
 
     size = np.bincount(parent, minlength=len(parent))[parent]
     nodes = np.flatnonzero(size >= 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -94,6 +94,10 @@ class Features:
         if colors.shape != (len(points), 3) or colors.dtype != np.uint8:
             raise InputError(f"rgb: expected uint8 of shape ({len(points)}, 3), found {colors.dtype} {colors.shape}")
         return cls(table, _checked(found, len(points), metric), np.ascontiguousarray(colors), metric)
+
+    def without_descriptors(self) -> Features:
+        """The same keypoints alone, an eighth of the memory."""
+        return replace(self, descriptors=np.zeros((len(self), 0), self.descriptors.dtype))
 
     def whole_numbers(self, count: int | None = None) -> NDArray[np.float32]:
         """The first ``count`` descriptors, or all, as whole numbers.

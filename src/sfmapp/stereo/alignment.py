@@ -104,14 +104,37 @@ def _take_window(rim: Array, window: Array, slopes: Array, inverse: Array) -> bo
             gx = 0.5 * (rim[r + 1, c + 2] - rim[r + 1, c])
             slopes[0, r, c], slopes[1, r, c] = gx, 0.5 * (rim[r + 2, c + 1] - rim[r, c + 1])
             slopes[2, r, c], slopes[3, r, c] = gx * (c - half), gx * (r - half)
-    window -= window.mean()
+    _take_off_mean(window)
     for k in range(4):
-        slopes[k] -= slopes[k].mean()
+        _take_off_mean(slopes[k])
     normal = np.empty((4, 4))
     for a in range(4):
         for b in range(4):
-            normal[a, b] = (slopes[a] * slopes[b]).sum()
+            normal[a, b] = _product(slopes[a], slopes[b])
     return _inverted(normal, inverse)
+
+
+# by hand: what numba brings for whole arrays takes seconds to compile
+@numba.njit(cache=True, nogil=True)
+def _take_off_mean(values: Array) -> None:
+    total = 0.0
+    for r in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            total += values[r, c]
+    mean = total / values.size
+    for r in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            values[r, c] -= mean
+
+
+@numba.njit(cache=True, nogil=True)
+def _product(a: Array, b: Array) -> float:
+    """Sum of the products of numbers in the same place."""
+    total = 0.0
+    for r in range(a.shape[0]):
+        for c in range(a.shape[1]):
+            total += a[r, c] * b[r, c]
+    return total
 
 
 @numba.njit(cache=True, nogil=True)
@@ -145,20 +168,23 @@ def _align(
     """Move and shear until nothing moves; out (2,) is left NaN where that leads astray or windows do not agree."""
     u = v = stretch = shear = 0.0
     correlation = 0.0
-    energy = (window * window).sum()
-    step = np.empty(4)
+    energy = _product(window, window)
+    step, left = np.empty(4), np.empty(window.shape)
     for _ in range(_ROUNDS):
         _sample(right, x + u, y + v, stretch, shear, seen)
         if math.isnan(seen[0, 0]):
             return
-        seen -= seen.mean()
-        product, other = (window * seen).sum(), (seen * seen).sum()
+        _take_off_mean(seen)
+        product, other = _product(window, seen), _product(seen, seen)
         if not product > 0.0:
             return
         correlation = product / math.sqrt(energy * other)
         gain = product / other
+        for r in range(window.shape[0]):
+            for c in range(window.shape[1]):
+                left[r, c] = window[r, c] - gain * seen[r, c]
         for k in range(4):
-            step[k] = (slopes[k] * (window - gain * seen)).sum()
+            step[k] = _product(slopes[k], left)
         move = inverse @ step
         u, v, stretch, shear = u + move[0], v + move[1], stretch + move[2], shear + move[3]
         if math.hypot(u, v) > _FARTHEST_PX or max(abs(stretch), abs(shear)) > _STEEPEST:

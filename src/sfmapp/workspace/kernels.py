@@ -8,6 +8,7 @@ to be compiled, a child process compiles in part.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -47,6 +48,7 @@ ODOMETRY_MODULES = (
     "sfmapp.geometry.epipolar",
     "sfmapp.mapping.structure",
     "sfmapp.adjust.compile",
+    "sfmapp.adjust.clustered",
     "sfmapp.adjust.calibration",
     "sfmapp.odometry.loops.relocalize",
     "sfmapp.odometry.loops.pose_graph",
@@ -101,6 +103,7 @@ def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
 
     wall, cpu = time.monotonic(), time.thread_time()
     helper = _Helper(modules, events)
+    gc.freeze()  # what numba builds and drops has Python look for rubbish among all that there is, again and again
     listener = _listener(events, helper)
     numba_event.register("numba:compile", listener)
     try:
@@ -117,6 +120,7 @@ def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
     except Exception as error:  # whoever calls the kernel next meets the same error, where it belongs
         events.warned(STAGE, f"compiling ahead failed: {type(error).__name__}: {error}")
     finally:
+        gc.unfreeze()
         helper.stop()
         numba_event.unregister("numba:compile", listener)
     num_compiled = listener.num_compiled + helper.num_compiled

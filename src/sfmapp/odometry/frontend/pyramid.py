@@ -81,10 +81,11 @@ def _halve_row(line: NDArray[np.uint16], target: Bytes, width: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _extend_rows(data: Bytes, top: int, step: int, height: int) -> None:
-    first, last = data[top : top + step], data[top + (height - 1) * step : top + height * step]
+    bottom = top + (height - 1) * step
     for r in range(1, PAD + 1):
-        data[top - r * step : top - (r - 1) * step] = first
-        data[top + (height - 1 + r) * step : top + (height + r) * step] = last
+        for k in range(step):
+            data[top - r * step + k] = data[top + k]
+            data[bottom + r * step + k] = data[bottom + k]
 
 
 @numba.njit(cache=True, nogil=True)

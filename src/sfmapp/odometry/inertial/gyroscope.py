@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3
+from sfmapp.simd.copying import copy_into
 
 if TYPE_CHECKING:
     from sfmapp.images.sequence import Imu
@@ -133,7 +134,9 @@ def turn_by(wx: float, wy: float, wz: float, out: Array, slope: Array) -> None:
 def integrate_rotation(steps: Array, gyro_bias: Array, turn: Array) -> None:
     """Rotation imu(start) from imu(stop) into turn (3, 3)."""
     step, slope, new = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    turn[:] = np.eye(3)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = 1.0 if i == j else 0.0
     for n in range(steps.shape[0]):
         h = steps[n, 0]
         turn_by(
@@ -141,7 +144,7 @@ def integrate_rotation(steps: Array, gyro_bias: Array, turn: Array) -> None:
             slope,
         )  # fmt: skip
         multiply(turn, step, new)
-        turn[:] = new
+        copy_into(turn, new)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.inertial.gyroscope import Turns, imu_steps, multiply, turn_by
+from sfmapp.simd.copying import copy_into
 
 if TYPE_CHECKING:
     from sfmapp.images.sequence import Imu
@@ -134,14 +135,17 @@ def integrate(steps: Array, gyro_bias: Array, out: Array) -> None:
                 v_a[i, j] -= half[i, j] * h
         turn_by(wx * h, wy * h, wz * h, step, slope)
         multiply(turn, step, new)
-        turn[:] = new
+        copy_into(turn, new)
         for i in range(3):
             for j in range(3):
                 new[i, j] = step[0, i] * r_g[0, j] + step[1, i] * r_g[1, j] + step[2, i] * r_g[2, j] - slope[i, j] * h
-        r_g[:] = new
-    out[:9], out[9:12], out[12:15] = turn.ravel(), velocity, position
-    out[15:24], out[24:33], out[33:42] = r_g.ravel(), v_g.ravel(), v_a.ravel()
-    out[42:51], out[51:60] = p_g.ravel(), p_a.ravel()
+        copy_into(r_g, new)
+    for i in range(3):
+        out[9 + i], out[12 + i] = velocity[i], position[i]
+        for j in range(3):
+            k = 3 * i + j
+            out[k], out[15 + k], out[24 + k] = turn[i, j], r_g[i, j], v_g[i, j]
+            out[33 + k], out[42 + k], out[51 + k] = v_a[i, j], p_g[i, j], p_a[i, j]
 
 
 def reintegrate(interval: Interval, gyro_bias: Array) -> Interval:

@@ -134,6 +134,8 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
         raise _too_few_photographs(image_set)
     import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     correspondences = find_matches(run, image_set, keys)
+    # all that follows knows pictures by keypoints and matches; descriptors are in the database
+    run.features = [features.without_descriptors() for features in run.features]
     with run.stage("mapping"):
         given = (image_set, run.features, correspondences, options.mapping)
         if run.poses is not None and options.poses.fixed:
