@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from concurrent.futures import Executor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,18 +78,22 @@ def test_what_is_no_model_is_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "expected a workspace of sfmapp or a COLMAP model" in capsys.readouterr().err
 
 
-def test_a_call_that_was_stopped_goes_on(wall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["sweep_planes", "exchange_planes"])
+def test_a_call_that_was_stopped_goes_on(
+    wall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     assert swept(wall, tmp_path / "whole", "--level", "1", "-q") == 0
     calls: list[int] = []
-    usual = sweep_pipeline.sweep_planes
+    usual = getattr(sweep_pipeline, name)
 
-    def sweep_planes(scene: DenseScene, view: int, pool: Executor | None = None) -> SweptPlanes:
+    def stopped(scene: DenseScene, view: int, *rest: Any) -> SweptPlanes:
         calls.append(view)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return usual(scene, view, pool)
+        found: SweptPlanes = usual(scene, view, *rest)
+        return found
 
-    monkeypatch.setattr(sweep_pipeline, "sweep_planes", sweep_planes)
+    monkeypatch.setattr(sweep_pipeline, name, stopped)
     out = tmp_path / "stopped"
     with contextlib.suppress(KeyboardInterrupt):
         assert swept(wall, out, "--level", "1", "-q") != 0
@@ -99,6 +103,7 @@ def test_a_call_that_was_stopped_goes_on(wall: Path, tmp_path: Path, monkeypatch
     assert len(calls) == 5
     for path in (tmp_path / "whole" / "maps").iterdir():
         assert path.read_bytes() == (out / "maps" / path.name).read_bytes()
+    assert not (out / "unconfirmed").exists()
 
 
 def test_page_occupancy_and_recording(wall: Path, tmp_path: Path) -> None:

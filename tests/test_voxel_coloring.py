@@ -203,6 +203,29 @@ def test_colors_that_were_stopped_go_on_to_the_same_bytes(folder: Path, carved: 
     assert (tmp_path / "out" / "mesh.ply").read_bytes() == (carved / "mesh.ply").read_bytes()
 
 
+def test_colors_that_were_stopped_at_their_exchange_leave_nothing_half_done(
+    folder: Path, carved: Path, tmp_path: Path
+) -> None:
+    what, options = CarveInput(folder, by_colors=True), sfmapp.load_options(settings=["carve.cells=64"])
+    events, told = sfmapp.Events(), []
+
+    def stop(event: sfmapp.Event) -> None:
+        if event.kind in ("started", "advanced") and event.stage == "sights":
+            told.append(event)
+            if len(told) > 1 + told[0].total // 2:
+                events.cancel()
+
+    events.subscribe(stop)
+    with pytest.raises(sfmapp.InterruptedRunError):
+        carve(what, tmp_path / "out", options, record=False, events=events)
+    assert len(told) < 1 + told[0].total
+    assert not (tmp_path / "out" / "sights.npz").exists()
+    found = carve(what, tmp_path / "out", options, record=False)
+    assert "sights" in found.report.usage
+    for name in ("mesh.ply", "octree_colors.npz", "sights.npz"):
+        assert (tmp_path / "out" / name).read_bytes() == (carved / name).read_bytes()
+
+
 def test_colors_and_patches_are_not_joined(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["carve", str(folder), "-o", str(tmp_path / "out"), "--colors", "--lights", "lights.json", "-q"]
     assert main(command) == 2

@@ -63,7 +63,8 @@ def sights_by_colors(
     places = around[:: max(1, len(around) // _PLACES)]
     seen_by = np.tile(np.arange(num, dtype=np.int32), len(places))
     scene = DenseScene(tuple(views), neighbors, places, num * np.arange(len(places) + 1), seen_by)
-    events.started(STAGE, f"planes through {num} photographs", total=num)
+    # swept, then held against each other
+    events.started(STAGE, f"planes through {num} photographs", total=2 * num)
 
     def sweep(v: int) -> SweptPlanes | None:
         events.raise_if_cancelled()
@@ -84,10 +85,13 @@ def sights_by_colors(
             events.raise_if_cancelled()
             return measured(scene, v, exchange_planes(scene, v, swept)) if v in swept else None
 
-        maps = list(pool.map(measure, range(num)))
+        maps: list[SweptDepth | None] = []
+        for depth in pool.map(measure, range(num)):
+            maps.append(depth)
+            events.advanced(STAGE)
         kept = list(pool.map(lambda v: _confirmed(scene, maps, v), range(num)))
     sights = [
-        sight_of_map(views[v].k, views[v].cam_from_world, depth) for v, depth in enumerate(kept) if depth is not None
+        sight_of_map(views[v].k, views[v].cam_from_world, told) for v, told in enumerate(kept) if told is not None
     ]
     if not sights:
         raise NoReconstructionError(
