@@ -89,12 +89,14 @@ class Tangents:
         miss: (V, V, 2) pixels by which the tangents of a view lie outside those of another, negative inside; infinite
             where one has the axis through both cameras in its silhouette and the other has not; NaN where they cannot
             be compared.
+        least_sigma: what :meth:`typical` is at least, pixels.
     """
 
     def __init__(self, views: Sequence[View], silhouettes: Sequence[Silhouette]) -> None:
         self._hulls = [_hull(view, silhouette) for view, silhouette in zip(views, silhouettes, strict=True)]
         self._centers = np.array([view.center for view in views])
         self._floor = np.sqrt(2.0) * np.array([silhouette.outline_sigma_px for silhouette in silhouettes])
+        self.least_sigma = float(self._floor.min())
         most = max((len(hull.rays) for hull in self._hulls if hull is not None), default=0)
         # as many rays of all: the last one again and again
         self._rays = np.full((len(views), most, 3), np.nan)
@@ -203,14 +205,15 @@ def find_contradicted(tangents: Tangents, used: Sequence[int], most: int) -> tup
     out: list[Contradicted] = []
     kept = list(used)
     while True:
-        # of those it is held against as many are left aside as may be blamed after it
+        ranked = sorted(kept, key={k: _against(tangents, k, kept) for k in kept}.__getitem__)
+        # of those it is held against as many are left aside, the worst, as may be blamed after it
         spare = max(0, most - len(out) - 1)
-        found = [each for i in kept if (each := _judged(tangents, i, _surest(tangents, i, kept, spare))) is not None]
+        found = [each for i in kept if (each := _judged(tangents, i, _surest(ranked, i, spare))) is not None]
         if not found:
             return out, are_in_agreement(tangents, kept)
-        worst = max(found, key=lambda each: _against(tangents, each.view, kept))
+        worst = max(found, key=lambda each: ranked.index(each.view))
         rivals = [each.view for each in found if each is not worst]
-        others = _surest(tangents, worst.view, kept, spare)
+        others = _surest(ranked, worst.view, spare)
         if len(out) == most or any(_judged(tangents, worst.view, _but(others, i), 2) is None for i in rivals):
             return [], False
         out.append(worst)
@@ -223,9 +226,9 @@ def is_contradictory(tangents: Tangents, used: Sequence[int]) -> bool:
     return bool(_contradict(miss[~np.isnan(miss)], _PLAIN_PX).any())
 
 
-def _surest(tangents: Tangents, i: int, kept: Sequence[int], spare: int) -> list[int]:
-    """The other kept views without some that miss the others most."""
-    others = sorted(_but(kept, i), key=lambda k: _against(tangents, k, kept))
+def _surest(ranked: Sequence[int], i: int, spare: int) -> list[int]:
+    """The others of some views, but for the last ones."""
+    others = _but(ranked, i)
     return sorted(others[: len(others) - spare])
 
 
@@ -233,18 +236,30 @@ def _judged(tangents: Tangents, i: int, others: Sequence[int], fewest: int = _FE
     """A view against others; None if it fits them, if they do not fit each other, or if fewer than some can tell."""
     miss = tangents.miss[i, others]
     miss = miss[~np.isnan(miss[:, 0])]
-    if len(miss) < fewest or not are_in_agreement(tangents, others):
+    if len(miss) < fewest or not _stands_out(miss, tangents.least_sigma):
+        return None
+    # which takes as long as all others are many
+    if not are_in_agreement(tangents, others):
         return None
     sigma = tangents.typical(others)
-    wrong = _contradict(np.abs(miss), sigma)
-    share = float(np.mean(wrong))
+    share = float(np.mean(_contradict(np.abs(miss), sigma)))
     if _rms(np.abs(miss)) >= _TURNED * sigma:
         turned = tangents.turned_back(i, others, sigma)
         if turned is not None and turned.after <= min(_MENDED * turned.before, _TURNED * sigma):
             return Contradicted(i, share, turned.angle_deg, turned.sigma_deg)
+    return Contradicted(i, share) if _contradicts_most(miss, sigma) else None
+
+
+def _stands_out(miss: Array, sigma: float) -> bool:
+    """Whether misses (N, 2) may be those of a view that is wrong."""
+    return _rms(np.abs(miss)) >= _TURNED * sigma or _contradicts_most(miss, sigma)
+
+
+def _contradicts_most(miss: Array, sigma: float) -> bool:
+    wrong = _contradict(np.abs(miss), sigma)
     # what spills is contradicted as well, but carves nothing
-    lacks = float(np.mean((wrong & ((miss < 0.0) | np.isinf(miss))).any(axis=1)))
-    return Contradicted(i, share) if max(share, lacks) > _MOST else None
+    lacks = (wrong & ((miss < 0.0) | np.isinf(miss))).any(axis=1)
+    return bool(max(np.mean(wrong), np.mean(lacks)) > _MOST)
 
 
 def _but(kept: Sequence[int], i: int) -> list[int]:

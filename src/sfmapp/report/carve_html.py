@@ -231,7 +231,8 @@ def _place(at: Sequence[float]) -> str:
 
 
 def _direction(way: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:.2f}" for value in way) + ")"
+    # no minus before what rounds to nought
+    return "(" + ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in way) + ")"
 
 
 def _slices(octree: Octree, mesh: Mesh) -> Iterator[str]:
@@ -252,7 +253,7 @@ def _levels(report: CarveReport) -> str:
     ]
     rows = [
         [
-            ("", level.level), ("", f"{level.side:.4g}"), ("", f"{8.0**level.level:.3g}"), ("", f"{level.looked_at:,}"),
+            ("", level.level), ("", f"{level.side:.4g}"), ("", f"{8**level.level:,}"), ("", f"{level.looked_at:,}"),
             ("", f"{level.full:,}"), ("", f"{level.carved:,}"), ("", f"{level.unseen:,}"), ("", f"{level.split:,}"),
         ]
         for level in carving.levels
