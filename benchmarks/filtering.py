@@ -4,11 +4,12 @@
     python benchmarks/filtering.py --only 3 5   # flown again, the others keep their rows
 
 Every second flight is one of a stereo pair; those with a star were looked at while the filter was made. NIS is the
-mean of normalised innovations squared, a degree of freedom, of all but the first five frames, beside its 95 % interval;
-NEES is of every tenth frame, of what has come to the errors since the filter's first row: what was wrong at that is the
-choice of a world. Beside stands the filter that takes the errors of poses for new in each frame. Gaps are frames from
-the middle of the filtered flight on whose poses the filter is not given, of one and the same run: their error is that
-at their last frame, of rotation and position about three axes each, in the standard deviations that the filter states.
+mean of normalised innovations squared, a degree of freedom, of all but the first five frames, rejected ones among
+them, beside its 95 % interval; NEES is of every tenth frame, of what has come to the errors since the filter's first
+row: what was wrong at that is the choice of a world. Beside stands the filter that takes the errors of poses for new
+in each frame. Gaps are frames from the middle of the filtered flight on whose poses the filter is not given, of one and
+the same run: their error is that at their last frame, of rotation and position about three axes each, in the standard
+deviations that the filter states.
 """
 
 from __future__ import annotations

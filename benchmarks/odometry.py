@@ -38,6 +38,7 @@ from sfmapp.evaluation.measured import ProcessUsage, run_measured
 from sfmapp.evaluation.second_opinion import CameraGroup, SecondOpinionOptions, ask_second_opinion
 from sfmapp.evaluation.trajectory import (
     KITTI_LENGTHS_M,
+    MIN_PAIRS,
     Trajectory,
     absolute_error,
     associate,
@@ -138,6 +139,8 @@ def ground_truth_numbers(out: Path, case: Case) -> dict[str, Any]:
         unit = json.loads((out / "report.json").read_text(encoding="utf-8"))["maps"][0]["unit"]
     except (SfmError, OSError, LookupError) as error:
         return {"ground_truth": None, "why": str(error)}
+    if len(result.pairs) < MIN_PAIRS:
+        return {"ground_truth": None, "why": f"{len(result.pairs)} poses say nothing of a trajectory"}
     errors = result.errors["se3" if unit == "m" else "sim3"]
     ate = statistics(errors.absolute.translation_m)
     assert ate is not None
@@ -207,11 +210,15 @@ def run_orb_slam3(case: Case, work: Path) -> dict[str, Any]:
     return values | {"num_with_pose": len(rows), "num_in_largest_map": len(rows), "ground_truth": found}
 
 
-def against(trajectory: Trajectory, ground_truth: GroundTruth, alignment: Literal["se3", "sim3"]) -> dict[str, Any]:
-    """What ``ground_truth_numbers`` has, of another program's trajectory."""
+def against(
+    trajectory: Trajectory, ground_truth: GroundTruth, alignment: Literal["se3", "sim3"]
+) -> dict[str, Any] | None:
+    """What ``ground_truth_numbers`` has, of another program's trajectory; None of fewer poses than tell anything."""
     pairs = associate(
         trajectory, Trajectory.from_cam_from_world(ground_truth.cam_from_world, ground_truth.timestamps_s)
     )
+    if len(pairs) < MIN_PAIRS:
+        return None
     error, path = absolute_error(pairs, alignment), pairs.ground_truth.path_m
     ate, lengths_m = statistics(error.translation_m), KITTI_LENGTHS_M
     assert ate is not None

@@ -266,6 +266,7 @@ MOST_PARAMETERS, MOST_OF_KERNELS = 8, 12
 LONG_LISTS = {
     "api/jobs.py track_sequence",
     "api/jobs.py undistort",
+    "api/live.py __init__",
     "api/stages.py match_images",
     "matching/stage.py match_images",
     "scene/synthetic.py make_scene",

@@ -272,6 +272,14 @@ def test_parts_are_not_sold_as_the_whole(tmp_path: Path) -> None:
     assert "1 gap" in result.table()
 
 
+def test_two_poses_say_nothing_of_a_trajectory(tmp_path: Path) -> None:
+    ground_truth = loop()
+    true = write_tum(tmp_path / "b.tum", ground_truth)
+    for count, said in ((2, True), (3, False)):
+        result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)[np.arange(count)]), true)
+        assert any("two poses say nothing" in note for note in result.notes) == said
+
+
 def test_a_straight_path_leaves_the_turn_about_it_open(tmp_path: Path) -> None:
     ground_truth = straight(100, 50.0)
     result = evaluate(write_tum(tmp_path / "a.tum", worse(ground_truth)), write_tum(tmp_path / "b.tum", ground_truth))

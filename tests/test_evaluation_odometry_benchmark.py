@@ -44,6 +44,17 @@ def run(case: str, repeat: int, cpu_s: float, digest: str = "a", exit_code: int 
     }  # fmt: skip
 
 
+def test_two_poses_have_no_error(odometry: ModuleType) -> None:
+    """A similarity lays any two on any other two: 0.00 would be no figure."""
+    poses = np.tile(rigid3.IDENTITY, (3, 1))
+    poses[:, 4] = [0.0, 1.0, 3.0]
+    poses[:, 5] = [0.0, 0.5, 0.0]
+    truth = GroundTruth(np.arange(3.0), poses)
+    for count in (2, 3):
+        found = odometry.against(Trajectory.from_cam_from_world(poses[:count], np.arange(count)), truth, "sim3")
+        assert (found is None) == (count == 2)
+
+
 def test_costs_are_medians_and_bytes_are_compared(odometry: ModuleType) -> None:
     runs = [run("drive", k, cpu) for k, cpu in enumerate([4, 5, 9])]
     runs += [run("room", 0, 4), run("room", 1, 4, digest="b"), run("hall", 0, 4)]

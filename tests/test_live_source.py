@@ -20,7 +20,8 @@ from sfmapp.images.addresses import without_credentials
 from sfmapp.images.frame_reader import Skipped
 from sfmapp.images.live_buffer import LiveBuffer, read_newest, taken_from
 from sfmapp.images.live_sequence import LiveSequence
-from sfmapp.images.sequence import Frame, SequenceOptions
+from sfmapp.images.sequence import Frame, Imu, SequenceOptions
+from sfmapp.odometry.inertial.filtering import FilteredPose
 from sfmapp.odometry.snapshot import FrameSnapshot
 from sfmapp.scene.rig import Rig
 from sfmapp.sequences.open import open_sequence
@@ -236,6 +237,55 @@ def test_what_is_pushed_is_tracked_as_it_would_be_from_a_list(tmp_path: Path) ->
     assert "30 frames came, 0 of them were dropped" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     with pytest.raises(sfmapp.UsageError, match="a run that has ended: closed"):
         odometry.push(images[0])
+
+
+def sensor(**changed: object) -> Imu:
+    still = {
+        "timestamps_s": np.zeros(0), "gyro": np.zeros((0, 3)), "accel": np.zeros((0, 3)),
+        "imu_from_cam": np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), "gyro_noise": 1e-4, "accel_noise": 1e-3,
+        "gyro_walk": 1e-5, "accel_walk": 1e-3,
+    }  # fmt: skip
+    return Imu(**(still | changed))  # type: ignore[arg-type]
+
+
+def test_inertial_samples_are_pushed_beside_frames(tmp_path: Path) -> None:
+    """A sensor that says it hardly moves while the camera walks: the report says why it does not predict."""
+    images = [images[0] for images in room(80).images]
+    filtered = list[FilteredPose]()
+    with sfmapp.LiveOdometry(
+        PINHOLE, tmp_path / "out", imu=sensor(), on_filtered=filtered.append, record=False
+    ) as odometry:
+        for number, image in enumerate(waiting_for_each(odometry, images)):
+            for k in range(4):
+                odometry.push_imu((number + 0.25 * k) / 20, np.zeros(3), [0.0, -9.81, 0.0])
+            odometry.push(image, (number + 0.8) / 20)
+            if number == 0:
+                for wrong in ((0.0, np.zeros(3), np.zeros(3)), (9.0, np.zeros(2), np.zeros(3))):
+                    with pytest.raises(sfmapp.InputError, match="IMU: expected"):
+                        odometry.push_imu(*wrong)
+                with pytest.raises(sfmapp.InputError, match="clock of the IMU"):
+                    odometry.push(image)
+    report = odometry.close().report
+    assert report is not None
+    told = report["stages"]["filter"]
+    assert told["prediction"] == "constant velocity"
+    assert told["reason"].startswith("the motion tells the scale to ")  # so that it is no start
+    assert not filtered
+    with pytest.raises(sfmapp.UsageError, match="a run that has ended"):
+        odometry.push_imu(99.0, np.zeros(3), np.zeros(3))
+
+
+def test_a_sensor_is_named_before_it_is_heard() -> None:
+    with pytest.raises(sfmapp.UsageError, match="need a sensor"):
+        sfmapp.LiveOdometry(PINHOLE, on_filtered=print)
+    for wrong in ({"accel_noise": 0.0}, {"gyro_walk": np.nan}, {"imu_from_cam": np.zeros(7)}):
+        with pytest.raises(sfmapp.InputError, match="IMU: expected"):
+            sfmapp.LiveOdometry(PINHOLE, imu=sensor(**wrong))
+    odometry = sfmapp.LiveOdometry(PINHOLE)
+    with pytest.raises(sfmapp.UsageError, match="no IMU was named"):
+        odometry.push_imu(0.0, np.zeros(3), np.zeros(3))
+    with pytest.raises(sfmapp.NoReconstructionError):
+        odometry.close()
 
 
 def test_a_program_that_fails_or_a_callback_that_does(tmp_path: Path) -> None:

@@ -11,9 +11,11 @@ from scipy.stats import chi2
 from inertial_flights import ACCEL_BIAS, GRAVITY, GYRO_BIAS, IMU_FROM_CAM, Flight
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.images.imu_stream import ImuStream
 from sfmapp.images.sequence import Imu
 from sfmapp.odometry.inertial.filter_state import INDEPENDENT, InertialSensor, Shared
 from sfmapp.odometry.inertial.filtering import (
+    FilteredPose,
     FilteredTrajectory,
     InertialFilter,
     consistency,
@@ -395,6 +397,46 @@ def lived(case: Case, imu: Imu | None, *, unit_m: float | None = None) -> tuple[
     found = beside.finish(Events())
     assert found is not None
     return found
+
+
+def test_samples_that_are_pushed_become_poses_at_once() -> None:
+    """Frames are tracked 70 ms after they were taken, and samples that came meanwhile go on from each."""
+    case, late_s, told = CASES[2], 0.07, list[tuple[float, FilteredPose]]()
+    imu, newest_s = case.sensor.imu, [0.0]
+    stream = ImuStream(replace(imu, timestamps_s=np.zeros(0), gyro=np.zeros((0, 3)), accel=np.zeros((0, 3))))
+    beside = LiveFilter(stream, is_metric=True, on_pose=lambda pose: told.append((newest_s[0], pose)))
+    frame = 0
+    for row in zip(imu.timestamps_s, imu.gyro, imu.accel, strict=True):
+        newest_s[0] = row[0]
+        stream.push(*row)
+        while frame < len(case.times) and case.times[frame] + late_s <= row[0]:
+            beside.add(snapshot(
+                case.times[frame], case.poses[frame], case.covariance[frame], Correlation(0.0, 0.0)
+            ))  # fmt: skip
+            frame += 1
+    poses = [pose for _, pose in told]
+    times = np.array([pose.timestamp_s for pose in poses])
+    # one for each sample, in order, at once; but for those between the frame that told the start and its sample
+    assert (np.diff(times) > 0).all()
+    assert np.mean(np.diff(times)) == pytest.approx(1 / RATE_HZ, rel=1e-3)
+    assert [pose.timestamp_s for now, pose in told if now > pose.timestamp_s + 1e-6][-1] < times[0] + 2 * late_s
+    assert poses[-1].since_pose_s == pytest.approx(late_s, abs=0.06)
+    later = times > times[0] + 1.0
+    assert later.sum() > 500
+    error = tangent(np.array([pose.cam_from_world for pose in poses])[later], case.flight.cam_from_world(times[later]))
+    sigma = np.sqrt(np.diagonal(np.array([pose.covariance for pose in poses])[later], axis1=1, axis2=2))
+    assert np.mean(np.abs(error) < 3.0 * sigma) > 0.99
+    # the same in the end as of measurements that were recorded
+    found, report = beside.finish(Events()) or (None, None)
+    recorded, _ = lived(case, imu)
+    assert report is not None
+    assert report.prediction == "imu"
+    assert found is not None
+    shared = np.isin(recorded.timestamps_s, found.timestamps_s)
+    np.testing.assert_allclose(
+        rigid3.center(recorded.cam_from_world[shared])[-50:],
+        rigid3.center(found.cam_from_world[np.isin(found.timestamps_s, recorded.timestamps_s)])[-50:], atol=5e-3,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("unit_m", [None, 2.0])

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from sfmapp.geometry.rigid3 import Rigid3
     from sfmapp.images.array_sequence import ArraySequence
     from sfmapp.images.image_set import ImageOptions, ImageSet, ImageSource
+    from sfmapp.images.sequence import Imu
     from sfmapp.mapping.options import MappingOptions
     from sfmapp.matching.options import MatchingOptions
     from sfmapp.matching.pairs import PairOptions
@@ -91,6 +92,7 @@ __all__ = [
     "ImageOptions",
     "ImageSet",
     "ImageSource",
+    "Imu",
     "InputError",
     "InterruptedRunError",
     "LiveOdometry",
@@ -162,6 +164,7 @@ _HOMES = {
     "ImageOptions": "images.image_set",
     "ImageSet": "images.image_set",
     "ImageSource": "images.image_set",
+    "Imu": "images.sequence",
     "InputError": "errors",
     "InterruptedRunError": "errors",
     "MappingOptions": "mapping.options",

@@ -626,14 +626,14 @@ def _told_of_frames(events: Events, on_frame: Callable[[FrameSnapshot], None] | 
 def _tracked_in_memory(source: FilePath | Sequence, options: Options, events: Events) -> OdometryResult:
     from sfmapp.errors import NoReconstructionError
     from sfmapp.odometry.run import run_odometry
-    from sfmapp.pipelines.odometry.filtering import LiveFilter
+    from sfmapp.pipelines.odometry.filtering import filter_beside
     from sfmapp.pipelines.odometry.scale import parse_scale, resolve_scale_request, scale_maps, takes_imu
 
     if isinstance(source, str | os.PathLike):
         raise UsageError("a sequence of files needs a folder for its results", "give one as the second argument")
     wanted = options.scale.source
     request = resolve_scale_request(None if wanted is None else parse_scale(wanted), wanted is None, source)
-    beside = LiveFilter(source.imu, is_metric=source.rig.is_stereo) if options.odometry.filter else None
+    beside = filter_beside(source) if options.odometry.filter else None
     with one_blas_thread(), _listening(events, beside):
         found = run_odometry(
             source, options.odometry, seed=options.seed, threads=options.num_workers, events=events,

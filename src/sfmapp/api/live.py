@@ -5,19 +5,23 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.api.jobs import TrackResult, options_with, track_sequence
 from sfmapp.errors import UsageError
 from sfmapp.events import Events
+from sfmapp.images.imu_stream import ImuStream
 from sfmapp.images.live_sequence import LiveSequence
 from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
     from sfmapp.camera.camera import Camera
+    from sfmapp.images.sequence import Imu
+    from sfmapp.odometry.inertial.filtering import FilteredPose
     from sfmapp.odometry.snapshot import FrameSnapshot
     from sfmapp.report.model import LiveReport
     from sfmapp.scene.rig import Rig
@@ -35,6 +39,11 @@ class LiveOdometry:
         output: folder of the results, as of :func:`track_sequence`; poses are in ``trajectory_live.tum`` as soon as
             they are known. None: nothing is written.
         options: of these, ``odometry`` and ``scale``.
+        imu: how a sensor is mounted and how noisy it is, whose measurements are pushed (:meth:`push_imu`); its arrays
+            may be empty. Poses are filtered with it, as by ``odometry.filter=true``.
+        on_filtered: called with each pose at the rate of the sensor, as soon as its sample is there and the first
+            seconds have told scale, gravity and biases; in metres, in the world of the live poses at that time. In
+            the thread that pushes or the one that tracks, never in both at once. What it raises, these raise.
         on_pose: called with each frame that was tracked, in the thread that tracks, which waits for it:
             ``cam_from_world`` (7,), NaN without a pose, ``timestamp_s``, ``latency_s``, ``state``. What it raises ends
             the run.
@@ -58,7 +67,9 @@ class LiveOdometry:
         output: str | os.PathLike[str] | None = None,
         options: Options | None = None,
         *,
+        imu: Imu | None = None,
         on_pose: Callable[[FrameSnapshot], None] | None = None,
+        on_filtered: Callable[[FilteredPose], None] | None = None,
         record: bool = True,
         events: Events | None = None,
         threads: int | None = None,
@@ -66,7 +77,16 @@ class LiveOdometry:
     ) -> None:
         from sfmapp.pipelines.odometry.live import LatencyLog
 
-        self._sequence, self._latencies = LiveSequence(camera, events or Events()), LatencyLog()
+        if imu is None and on_filtered is not None:
+            raise UsageError(
+                "poses at the rate of a sensor need a sensor", "say with imu= how it is mounted and how noisy"
+            )
+        self._stream = None if imu is None else ImuStream(imu)
+        self._sequence = LiveSequence(camera, events or Events(), imu_stream=self._stream, on_filtered=on_filtered)
+        self._latencies = LatencyLog()
+        if imu is not None:
+            options = options or Options()
+            options = replace(options, odometry=replace(options.odometry, filter=True))
         self._on_pose = on_pose
         self._latest: FrameSnapshot | None = None
         self._result: TrackResult | None = None
@@ -109,6 +129,26 @@ class LiveOdometry:
             raise UsageError(f"a frame was pushed into a run that has ended: {self._sequence.counts.end}")
         self._sequence.push(images, timestamp_s)
 
+    def push_imu(self, timestamp_s: float, gyro: ArrayLike, accel: ArrayLike) -> None:
+        """Add a sample of the sensor, from any thread; it never waits for a frame.
+
+        Args:
+            timestamp_s: on the clock of the frames, seconds, strictly ascending. Frames may come later than samples of
+                their time, and are of most use when no sample of theirs is still missing.
+            gyro, accel: (3,) rad/s and m/s^2 in the sensor's own frame, gravity included.
+
+        Raises:
+            InputError: a time that does not ascend, or numbers that are none. The sample is left out.
+            UsageError: no sensor was named, or the run has ended.
+        """
+        if self._stream is None:
+            raise UsageError("a sample of an IMU was pushed, but no IMU was named", "say with imu= how it is mounted")
+        if not self._thread.is_alive():
+            if self._failure is not None:
+                raise self._failure
+            raise UsageError(f"a sample was pushed into a run that has ended: {self._sequence.counts.end}")
+        self._stream.push(timestamp_s, gyro, accel)
+
     def close(self) -> TrackResult:
         """No more frames: waits for the closing adjustment, and for what is written.
 
@@ -139,7 +179,9 @@ class LiveOdometry:
 
         try:
             if output is None:
-                compile_odometry_kernels(events, inertial=False)  # before frames come, which would be dropped
+                compile_odometry_kernels(
+                    events, inertial=self._stream is not None
+                )  # before frames come, which would be dropped
             self._result = track_sequence(
                 self._sequence, output, options, record=record, on_frame=self._note, events=events
             )

@@ -43,6 +43,8 @@ PATH_SHARES = tuple(k / 10 for k in range(1, 9))
 DELTA_TOLERANCE = 0.1
 """Pairs whose distance in seconds or metres is off by more than this share of it do not count as that far apart."""
 
+# A similarity has seven numbers, and lays any two positions on any other two: of fewer pairs no error is one.
+MIN_PAIRS = 3
 # A step between neighbours longer than this many median steps is a gap: one lost frame at a regular rate, with room
 # for a jittering clock, is none yet.
 _GAP_STEPS = 2.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from sfmapp.camera.camera import Camera
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.images.array_sequence import gray_images
+from sfmapp.images.imu_stream import ImuStream
 from sfmapp.images.live_buffer import LiveBuffer, LiveCounts, taken_from
 from sfmapp.images.sequence import Frame, GroundTruth, Imu, SequenceKind
 from sfmapp.scene.rig import Rig
@@ -24,6 +25,8 @@ class LiveSequence:
     Args:
         camera: what takes the frames, or the rig of them.
         events: a wish to stop ends it.
+        imu_stream: what is measured beside the frames. on_filtered: told of each pose that is filtered at the rate of
+            these (:class:`~sfmapp.odometry.inertial.filtering.FilteredPose`).
         buffer: where frames wait.
     """
 
@@ -35,9 +38,13 @@ class LiveSequence:
     imu: Imu | None = None
     ground_truth: GroundTruth | None = None
 
-    def __init__(self, camera: Camera | Rig, events: Events, buffer: LiveBuffer | None = None) -> None:
+    def __init__(
+        self, camera: Camera | Rig, events: Events, buffer: LiveBuffer | None = None, *,
+        imu_stream: ImuStream | None = None, on_filtered: Callable[[Any], None] | None = None,
+    ) -> None:  # fmt: skip
         self.rig = camera if isinstance(camera, Rig) else Rig.single(camera)
         self.is_walked = threading.Event()
+        self.imu_stream, self.on_filtered = imu_stream, on_filtered
         self._events, self._buffer = events, buffer or LiveBuffer()
         self._lock = threading.Lock()
         self._idx, self._last_s = 0, -math.inf
@@ -54,6 +61,8 @@ class LiveSequence:
         captured_s = self._buffer.clock()
         with self._lock:
             name = f"{self._idx:06d}"
+            if timestamp_s is None and self.imu_stream is not None:
+                raise InputError(f"frame {name}: expected its time on the clock of the IMU, found none")
             if timestamp_s is None:
                 self._begin_s = captured_s if self._begin_s is None else self._begin_s
                 timestamp_s = max(captured_s - self._begin_s, self._last_s + 1e-6)

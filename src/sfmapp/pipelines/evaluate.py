@@ -17,6 +17,7 @@ from sfmapp.evaluation.report import Statistics
 from sfmapp.evaluation.trajectory import (
     KITTI_LENGTHS_M,
     MAX_DIFFERENCE_S,
+    MIN_PAIRS,
     AbsoluteError,
     Alignment,
     DeltaUnit,
@@ -321,6 +322,8 @@ def _notes(result: Evaluation, options: EvaluateOptions) -> list[str]:
             "rest, "
             "and are not comparable with those of a run that covers more"
         )
+    if len(pairs) < MIN_PAIRS:
+        notes.append("two poses say nothing of a trajectory: a similarity lays any two positions on the true ones")
     left = pairs.num_estimate - len(np.unique(pairs.estimate_idx))
     if left and pairs.num_ground_truth > pairs.num_estimate:
         notes.append(f"{left} poses of the estimate have no true one within {options.max_difference_s:g} s")

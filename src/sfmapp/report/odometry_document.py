@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
 from sfmapp.evaluation.trajectory import (
+    MIN_PAIRS,
     AbsoluteError,
     Alignment,
     Pairs,
@@ -197,6 +198,8 @@ def _against(result: OdometryResult, poses: Array, ground_truth: GroundTruth, is
             Trajectory.from_cam_from_world(ground_truth.cam_from_world, times),
             max_difference_s=step / 2,
         )
+        if len(pairs) < MIN_PAIRS:
+            return None
         return GroundTruthFit(pairs, absolute_error(pairs, alignment), alignment)
     except InputError:
         return None

@@ -16,6 +16,7 @@ import itertools
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -95,6 +96,16 @@ class FilteredTrajectory:
         """(N,) standard deviation of the rotation, the root of the sum over the axes."""
         sigma: Array = np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
         return sigma
+
+
+class FilteredPose(NamedTuple):
+    """A pose as it is given out, at a sample of the sensor; see :class:`FilteredTrajectory` for what each means."""
+
+    timestamp_s: float
+    cam_from_world: Array
+    covariance: Array
+    since_pose_s: float
+    is_bridged: bool
 
 
 def filter_trajectory(
@@ -181,6 +192,13 @@ class _Row(NamedTuple):
     latency_s: float
     widening: float
 
+    def as_given(self) -> FilteredPose:
+        """The same in the order of the error of poses."""
+        change = np.linalg.inv(error_from_tangent(self.rotation[None])[0])
+        pose = rigid3.inverse(rigid3.from_matrix(self.rotation, self.center))
+        covariance = change @ self.covariance @ change.T
+        return FilteredPose(self.timestamp_s, pose, covariance, self.since_pose_s, self.is_bridged)
+
 
 class _Sample(NamedTuple):
     """What the sensor said at a moment: gyro and accel (6,)."""
@@ -195,12 +213,16 @@ class InertialFilter:
     A sample moves the state on, and is a row at once. A pose corrects the state at its own time, also where samples
     have gone on meanwhile: these are integrated anew from there.
 
+    Attributes:
+        on_pose: called with the row of each sample, as soon as it is there.
+
     Args:
         sensor: its ``imu`` tells mounting and noises here, its measurements come one by one.
         speed: standard deviation of a velocity of which nothing is known, m/s.
     """
 
     def __init__(self, sensor: InertialSensor, speed: float, options: SmoothingOptions = LIVE) -> None:
+        self.on_pose: Callable[[FilteredPose], None] | None = None
         self._options, self._start = options, FilterState(sensor, speed)
         self._anchor: FilterState | None = (
             None  # at the last frame, which was used or not; None: begins with the next pose
@@ -227,6 +249,8 @@ class InertialFilter:
             self._head_s = timestamp_s
             is_late = timestamp_s - self._used_s > _DROPPED * self._interval_s
             self._note(self._head, timestamp_s, self._is_waiting or is_late, begin)
+            if self.on_pose is not None:
+                self.on_pose(self._rows[-1].as_given())
         elif self._head is None:
             del self._samples[:-2]
 

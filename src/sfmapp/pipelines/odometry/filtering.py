@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,10 +15,13 @@ from numpy.typing import NDArray
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Event, Events
 from sfmapp.geometry import similarity
-from sfmapp.images.sequence import Imu
+from sfmapp.images.imu_stream import ImuStream
+from sfmapp.images.live_sequence import LiveSequence
+from sfmapp.images.sequence import Imu, Sequence
 from sfmapp.odometry.inertial.filter_state import INDEPENDENT, Shared
 from sfmapp.odometry.inertial.filtering import (
     LIVE,
+    FilteredPose,
     FilteredTrajectory,
     InertialFilter,
     consistency,
@@ -110,22 +114,44 @@ class _MapFilter:
     reason: str = ""
 
 
+def filter_beside(sequence: Sequence) -> LiveFilter:
+    """The filter of a run over a sequence."""
+    is_metric = sequence.rig.is_stereo
+    if isinstance(sequence, LiveSequence) and sequence.imu_stream is not None:
+        return LiveFilter(sequence.imu_stream, is_metric=is_metric, on_pose=sequence.on_filtered)
+    return LiveFilter(sequence.imu, is_metric=is_metric)
+
+
+def pushes_imu(sequence: Sequence) -> bool:
+    """Whether inertial measurements come one by one beside the frames."""
+    return isinstance(sequence, LiveSequence) and sequence.imu_stream is not None
+
+
 class LiveFilter:
     """Listener of a run that filters its live poses, each map apart.
 
     With a sensor each row is found as its sample comes. Without one the poses wait for the end, as the level of the
     accelerations is that of all; each row still knows only of what came before it.
 
+    A sample that a program pushes goes on from the last frame at once, in the thread that pushes; where the filter is
+    busy with a frame, it goes on from that, in the thread that tracks.
+
     Args:
-        imu: on the clock of the frames; None without one.
+        imu: on the clock of the frames, all of it or as it comes; None without one.
         is_metric: live poses are in metres.
+        on_pose: called with the row of each sample once the sensor predicts.
     """
 
-    def __init__(self, imu: Imu | None, *, is_metric: bool) -> None:
-        self._imu, self._is_metric = imu, is_metric
+    def __init__(
+        self, imu: Imu | ImuStream | None, *, is_metric: bool, on_pose: Callable[[FilteredPose], None] | None = None
+    ) -> None:
+        self._imu, self._is_metric, self._on_pose = imu, is_metric, on_pose
         self._maps: dict[int, _MapFilter] = {}
         self._current = -1
         self._shared = SharedErrors()
+        self._lock = threading.Lock()
+        if isinstance(imu, ImuStream):
+            imu.listen(self._sense_newest)
 
     def __call__(self, event: Event) -> None:
         seen = event.data.get("snapshot")
@@ -134,6 +160,10 @@ class LiveFilter:
 
     def add(self, frame: FrameSnapshot) -> None:
         """Take a frame along as it was given out."""
+        with self._lock:
+            self._add(frame)
+
+    def _add(self, frame: FrameSnapshot) -> None:
         shared, has_pose = self._shared.add(frame), bool(np.isfinite(frame.cam_from_world[0]))
         if has_pose and frame.map_idx != self._current:
             self._current = frame.map_idx
@@ -151,9 +181,36 @@ class LiveFilter:
         if self._imu is None:
             return
         if now.inertial is not None:
-            self._go_on(now, now.inertial, self._imu, len(now.times_s) - 1)
+            self._go_on(now, now.inertial, len(now.times_s) - 1)
         elif has_pose:
-            self._begin(now, self._imu)
+            self._begin(now, self._imu.recorded() if isinstance(self._imu, ImuStream) else self._imu)
+        if isinstance(self._imu, ImuStream) and now.inertial is not None:  # what came while it was busy
+            self._sense(now, now.inertial, math.inf)
+
+    def _sense_newest(self) -> None:
+        """A sample has come."""
+        if self._lock.acquire(blocking=False):
+            try:
+                now = self._maps.get(self._current)
+                if now is not None and now.inertial is not None:
+                    self._sense(now, now.inertial, math.inf)
+            finally:
+                self._lock.release()
+
+    def _sense(self, now: _MapFilter, inertial: InertialFilter, until_s: float) -> None:
+        """The samples until a moment."""
+        while (sample := self._sample(now.next_sample)) is not None and sample[0] - now.clock_offset_s <= until_s:
+            inertial.add_sample(float(sample[0]) - now.clock_offset_s, sample[1:4], sample[4:])
+            now.next_sample += 1
+
+    def _sample(self, idx: int) -> Array | None:
+        """(7,) time, rates and forces; None where there is none yet."""
+        imu = self._imu
+        if isinstance(imu, ImuStream):
+            return imu.sample(idx)
+        if imu is None or idx >= len(imu.timestamps_s):
+            return None
+        return np.concatenate([imu.timestamps_s[idx : idx + 1], imu.gyro[idx], imu.accel[idx]])
 
     def _begin(self, now: _MapFilter, imu: Imu) -> None:
         """Look for a start in the last seconds, once in a while, and go through them: what the filter knows at their
@@ -175,19 +232,17 @@ class LiveFilter:
         now.next_sample = max(0, after - 2)
         inertial = InertialFilter(found.sensor, _UNKNOWN_SPEED)
         for n in range(first, len(times)):
-            self._go_on(now, inertial, imu, n)
+            self._go_on(now, inertial, n)
         now.reason = why_too_early(*inertial.start_sigmas)
         if not now.reason:
             inertial.settle()
+            inertial.on_pose = self._on_pose
             now.inertial, now.first = inertial, len(times) - 1
 
-    def _go_on(self, now: _MapFilter, inertial: InertialFilter, imu: Imu, n: int) -> None:
+    def _go_on(self, now: _MapFilter, inertial: InertialFilter, n: int) -> None:
         """The samples until a frame, and the frame."""
-        frame_s, times = now.times_s[n], imu.timestamps_s
-        while now.next_sample < len(times) and times[now.next_sample] - now.clock_offset_s <= frame_s:
-            k = now.next_sample
-            inertial.add_sample(float(times[k] - now.clock_offset_s), imu.gyro[k], imu.accel[k])
-            now.next_sample += 1
+        frame_s = now.times_s[n]
+        self._sense(now, inertial, frame_s)
         measured = read_measured(
             [frame_s], in_metres(now.poses[n][None], now.scale), scale_covariance(now.covariances[n], now.scale)[None]
         )

@@ -21,7 +21,7 @@ from sfmapp.images.sequence import Frame, GroundTruth, Imu, Sequence, SequenceKi
 from sfmapp.images.video import VideoSequence
 from sfmapp.odometry.result import FrameState, OdometryResult
 from sfmapp.odometry.run import run_odometry
-from sfmapp.pipelines.odometry.filtering import LiveFilter
+from sfmapp.pipelines.odometry.filtering import filter_beside, pushes_imu
 from sfmapp.pipelines.odometry.known_map import read_known_map
 from sfmapp.pipelines.odometry.live import live_counts
 from sfmapp.pipelines.odometry.results import write_odometry
@@ -137,12 +137,13 @@ def _run(run: Tracking, self_calibrate: bool) -> TrackResult:
     if run.live is not None:
         run.live.begin(run.sequence)
     with run.stage("kernels"):
-        compiled = compile_odometry_kernels(events, inertial=run.sequence.imu is not None)
+        has_imu = run.sequence.imu is not None or pushes_imu(run.sequence)
+        compiled = compile_odometry_kernels(events, inertial=has_imu)
         run.stages = replace(run.stages, kernels=compiled)
     run.save_first(lambda: run.workspace.begin(ODOMETRY, ""))
     beside = None
     if options.odometry.filter:
-        beside = LiveFilter(run.sequence.imu, is_metric=run.sequence.rig.is_stereo)
+        beside = filter_beside(run.sequence)
         run.listen(beside)
     with run.measured("odometry"):
         result = run_odometry(
