@@ -105,6 +105,7 @@ def rows_of(folder: Path) -> list[Row]:
         "carving": carving_rows,
         "carving_joined": joined_rows,
         "carving_tolerance": tolerance_rows,
+        "carving_wrong_views": wrong_view_rows,
         "voxel_coloring": color_rows,
         "shadow_carving": shadow_rows,
         "masks": mask_rows,
@@ -419,6 +420,18 @@ def tolerance_rows(folder: Path) -> Iterator[Row]:
         if kind == "hole":
             what, clean = "clean masks, IoU with the clean hull", 100.0 * mine[0]["clean"]
             yield Row("carving_tolerance", label, what, "%", "more", clean, "strict carving", 100.0, *about)
+
+
+def wrong_view_rows(folder: Path) -> Iterator[Row]:
+    """One view that is wrong among others: whether it is named, and no other."""
+    report = read(folder, "carving_wrong_views")
+    about = (False, report["date"][:10], report["commit"])
+    for kind in dict.fromkeys(row["kind"] for row in report["rows"]):
+        mine = [row for row in report["rows"] if row["kind"] == kind]
+        named = 100.0 * sum(row["named"] for row in mine) / len(mine)
+        yield Row("carving_wrong_views", kind, f"named, of {len(mine)}", "%", "more", named, "", None, *about)
+        others = sum(row["wrongly_named"] for row in mine)
+        yield Row("carving_wrong_views", kind, "others named", "count", "less", others, "", None, *about)
 
 
 def mask_rows(folder: Path) -> Iterator[Row]:

@@ -148,7 +148,8 @@ class Tangents:
         # next to nothing is known of a turn that changes no outline
         spread = np.linalg.inv(told_of + 1e-9 * np.trace(told_of) * np.eye(3))
         return Turned(
-            np.degrees(angle), float(np.degrees(sigma * np.sqrt(along @ spread @ along))), _rms(before), _rms(after, 3)
+            float(np.degrees(angle)), float(np.degrees(sigma * np.sqrt(along @ spread @ along))), _rms(before),
+            _rms(after, 3),
         )  # fmt: skip
 
     def _misses(self, i: int, rays: Array | None = None) -> tuple[Array, Array]:
