@@ -111,9 +111,19 @@ def rows_of(folder: Path) -> list[Row]:
         "masks": mask_rows,
         "masks_still": still_mask_rows,
         "matching": matching_rows,
+        "memory": memory_rows,
         "cold_start": first_run_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
+
+
+def memory_rows(folder: Path) -> Iterator[Row]:
+    """Memory of SIFT beside the package before a window of rows moved over its octaves."""
+    report = read(folder, "memory")
+    about = (False, report["date"][:10], report["commit"])
+    for row in report["rows"]:
+        for key, what, unit in (("peak_mb", "peak memory", "MB"), ("cpu_s", "CPU time", "s")):
+            yield Row("memory", row["case"], what, unit, "less", row[key], "f96fb8e", row.get(f"before_{key}"), *about)
 
 
 def first_run_rows(folder: Path) -> Iterator[Row]:
@@ -621,6 +631,9 @@ def promises(folder: Path) -> Iterator[Promise]:
     runs, date = read(folder, "cold_start")["runs"], read(folder, "cold_start")["date"][:10]
     text = "two cores work off what the first run of a command takes more in 15 s (demo 25 s)"
     yield Promise("cold_start", text, sum(row["more_cpu_s"] <= row["most_more_cpu_s"] for row in runs), len(runs), date)
+    rows, date = read(folder, "memory")["rows"], read(folder, "memory")["date"][:10]
+    text = "SIFT on photographs of 6.8 megapixels takes less than 700 MB on two workers"
+    yield Promise("memory", text, sum(row["peak_mb"] < row["most_mb"] for row in rows), len(rows), date)
     report = read(folder, "surveys")
     found, wrong = (sum(row[name] for row in report["rows"]) for name in ("found", "wrong"))
     yield Promise("surveys", "a grossly wrong position is found", found, wrong, report["date"][:10])
