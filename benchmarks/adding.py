@@ -1,4 +1,4 @@
-"""Photographs added in batches to a reconstruction, beside all of them reconstructed at once.
+"""Photographs added in batches to a reconstruction, and two models merged, beside all of them at once.
 
     python benchmarks/adding.py                          # sets with ground truth, several random orders each
     python benchmarks/adding.py --sets fountain-P11 --orders 5
@@ -7,7 +7,7 @@ Each order is five batches: the first, photographs nearest to a random one (a fi
 reconstructed, the others, at random, are added with ``--add``. Errors are those of centres and rotations after a
 similarity, means over all photographs; those of all at once are means of three seeds, beside the least and the largest.
 CPU seconds are those of all runs of an order together. ``late link``: two views of the courtyard that
-have no match with the first ones, and then those between.
+have no match with the first ones, and then those between. Two models that share three photographs are merged.
 
 An output that is there already goes on from where it was.
 """
@@ -32,12 +32,18 @@ from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.formats.ground_truth import read_ground_truth
 from sfmapp.geometry import rigid3
 from sfmapp.pipelines.sparse.add import add_photographs
+from sfmapp.pipelines.sparse.merge import merge_reconstructions
 from sfmapp.pipelines.sparse.reconstruct import RunResult, reconstruct
 from sfmapp.workspace.options import load_options
 from sparse import DATA
 
 SETS = ("fountain-P11", "herz-jesus-P8", "temple-sparse-ring", "strecha-courtyard-21", "lund-door", EXACT)
 NUM_BATCHES, LEAST, NUM_SEEDS = 5, 5, 3
+# two models of a set that share three photographs
+HALVES = {
+    "fountain-P11": (range(7), range(4, 11)),
+    "strecha-courtyard-21": (range(12), range(7, 21)),
+}
 # views of the courtyard: of the fountain, two of the far end of the entry, and those between
 SIDES = (range(10, 15), (8, 9), (*range(8), *range(15, 21)))
 
@@ -121,6 +127,20 @@ def measure_late_link(work: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def measure_merge(name: str, work: Path) -> dict[str, Any]:
+    """Two models of a set made one."""
+    names, folders = names_in(folder_of(name) / "images"), []
+    for k, half in enumerate(HALVES[name]):
+        folders.append(work / f"photos {k}")
+        folders[k].mkdir(parents=True)
+        for i in half:
+            shutil.copyfile(folder_of(name) / "images" / names[i], folders[k] / names[i])
+        reconstruct(folders[k], work / str(k), record=False)
+    found = merge_reconstructions(work / "0", work / "1", work / "both", record=False)
+    assert found.report.merged is not None
+    return {"case": name, "num": len(names), "off_sigmas": found.report.merged.off_sigmas} | errors(name, found)
+
+
 def of_whole(report: dict[str, Any], name: str, what: str) -> list[float]:
     """A figure of a set in all runs at once."""
     return [float(run[what]) for row in report["whole"] if row["case"] == name for run in row["runs"]]
@@ -148,6 +168,13 @@ def markdown(report: dict[str, Any]) -> str:
             f"| {row['center_share'] / np.mean(center):.3f} | {row['rotation_deg']:.4f} ({np.mean(rotation):.4f}) "
             f"| {row['rotation_deg'] / np.mean(rotation):.3f} | {row['cpu_s']:.0f} ({np.mean(cpu):.0f}) |"
         )
+    for row in report["merged"]:
+        center, rotation = (of_whole(report, row["case"], what) for what in ("center_share", "rotation_deg"))
+        text = f"Two halves of {row['case']} merged: {row['registered']} of {row['num']} photographs"
+        beside = "" if not center else f", {row['center_share'] / np.mean(center):.3f} and "
+        beside += "" if not center else f"{row['rotation_deg'] / np.mean(rotation):.3f} times all at once"
+        off = f"centres off by {row['center_share']:.3e}, rotations by {row['rotation_deg']:.4f} degrees"
+        lines += ["", f"{text}, {off}{beside}; shared ones {row['off_sigmas']:.1f} sigmas apart before."]
     for row in report["late"]:
         sides = ", ".join(str(n) for n in row["registered"])
         reasons = "; ".join(sorted({one["reason"] for one in row["left_over"] if one["model"] != 0}))
@@ -163,7 +190,7 @@ def main() -> None:
     parser.add_argument("--orders", type=int, default=3)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "adding.json")
     args = parser.parse_args()
-    report: dict[str, Any] = describe_machine() | {"whole": [], "rows": [], "late": []}
+    report: dict[str, Any] = describe_machine() | {"whole": [], "rows": [], "merged": [], "late": []}
     if args.output.exists():
         report = json.loads(args.output.read_text(encoding="utf-8"))
 
@@ -177,6 +204,8 @@ def main() -> None:
         work = Path(folder)
         if not report["late"]:
             keep("late", measure_late_link(work / "late"))
+        for name in set(HALVES) - {row["case"] for row in report["merged"]}:
+            keep("merged", measure_merge(name, work / f"{name} halves"))
         for name in args.sets:
             if not any(row["case"] == name for row in report["whole"]):
                 keep("whole", measure_whole(name, work / f"{name} whole"))

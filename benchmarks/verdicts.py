@@ -735,6 +735,36 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "put down before the corner that has no like it knows its place within 60 frames"
     before = [row["outcome"] == "right" for row in rows if row["kind"] == "towards the corner"]
     yield Promise("kidnapped", text, sum(before), len(before), date)
+    report = read(folder, "locating")
+    rows, date = report["sets"], report["date"][:10]
+    text = "photographs left out of a set are located in the model of the rest"
+    yield Promise("locating", text, sum(row["located"] for row in rows), sum(row["held_out"] for row in rows), date)
+    text = "their centres are off by no more than half beyond those of all at once"
+    good = [row["center_share"] <= 1.5 * row["center_share_all"] for row in rows]
+    yield Promise("locating", text, sum(good), len(rows), date)
+    text = "their NEES against exact and surveyed poses is between 0.5 and 2"
+    yield Promise("locating", text, sum(0.5 <= row["nees"] <= 2.0 for row in rows), len(rows), date)
+    for model in ("whole hall", "half of it"):
+        rows = [row for hall in report["halls"] if hall["model"] == model for row in hall["rows"]]
+        text = (
+            f"a photograph in a hall of look-alikes, with a model of the {model}, is where it is said to be, or refused"
+        )
+        yield Promise("locating", text, sum(row["outcome"] != "wrong" for row in rows), len(rows), date)
+    report = read(folder, "adding")
+    rows, date = [row for row in report["rows"] if "center_share" in row], report["date"][:10]
+
+    def at_once(row: dict[str, Any], what: str) -> float:
+        runs = [run for one in report["whole"] if one["case"] == row["case"] for run in one["runs"]]
+        return sum(run[what] for run in runs) / len(runs)
+
+    text = "photographs added in five batches: centres are off by no more than 5 % beyond those of all at once"
+    good = [row["center_share"] <= 1.05 * at_once(row, "center_share") for row in rows]
+    yield Promise("adding", text, sum(good), len(rows), date)
+    text = "the same of rotations"
+    good = [row["rotation_deg"] <= 1.05 * at_once(row, "rotation_deg") for row in rows]
+    yield Promise("adding", text, sum(good), len(rows), date)
+    text = "the same of how many photographs are registered"
+    yield Promise("adding", text, sum(row["registered"] >= at_once(row, "registered") for row in rows), len(rows), date)
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
