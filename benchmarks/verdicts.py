@@ -86,6 +86,7 @@ def rows_of(folder: Path) -> list[Row]:
     makers = {
         "sparse": sparse_rows,
         "bundle_adjustment": adjustment_rows,
+        "large_adjustment": large_adjustment_rows,
         "dense": dense_rows,
         "odometry": odometry_rows,
         "calibration": calibration_rows,
@@ -545,6 +546,22 @@ def adjustment_rows(folder: Path) -> Iterator[Row]:
             "bundle_adjustment", f"{row['model']}, {row['loss']} loss", "CPU time", "s", "less", row["sfmapp"]["cpu_s"],
             "Ceres", row["ceres"]["cpu_s"], False, report["date"][:10], report["commit"],
         )  # fmt: skip
+
+
+def large_adjustment_rows(folder: Path) -> Iterator[Row]:
+    """Large adjustments against an earlier commit, and against Ceres."""
+    report = read(folder, "large_adjustment")
+    about = (False, report["date"][:10], report["commit"])
+    for row in report["rows"]:
+        ours = [r for r in report["rows"] if r["set"] == row["set"] and r["program"] == "sfmapp" and r["threads"] == 1]
+        if row["program"] not in ("before", "ceres") or not ours:
+            continue
+        peer = "Ceres" if row["program"] == "ceres" else f"sfmapp at {report['before']}"
+        for key, quantity, unit in (
+            ("step_cpu_s", "CPU time of a step", "s"), ("cpu_s", "CPU time to the minimum", "s"),
+            ("cost", "cost at the minimum", "px^2"), ("peak_mb", "peak memory", "MB"),
+        ):  # fmt: skip
+            yield Row("large_adjustment", row["set"], quantity, unit, "less", ours[0][key], peer, row[key], *about)
 
 
 def dense_rows(folder: Path) -> Iterator[Row]:

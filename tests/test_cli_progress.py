@@ -28,3 +28,17 @@ def test_quiet_passes_on_warnings_alone(capsys: pytest.CaptureFixture[str]) -> N
     events.warned("features", "dark.jpg: no features")
     events.finished("features")
     assert capsys.readouterr().err == "warning: dark.jpg: no features\n"
+
+
+def test_steps_whose_number_nobody_knows_are_told_by_what_they_say(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sfmapp.cli.progress.PLAIN_PERIOD_S", 0.0)
+    events = Events(PlainLines())
+    events.started("mapping", total=10)
+    events.started("bundle adjustment", "1000 images")
+    events.advanced("bundle adjustment", message="step 1 of at most 25, cost 12.5")
+    events.advanced("mapping", 5)
+    said = capsys.readouterr().err.splitlines()
+    assert said[1] == "bundle adjustment: step 1 of at most 25, cost 12.5"
+    assert said[2].startswith("mapping: 5 of 10, about ")

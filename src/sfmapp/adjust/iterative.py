@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.elimination import COLUMNS
 from sfmapp.adjust.envelope import EnvelopeSystem
 from sfmapp.adjust.kernels import ImageArrays, LensArrays, Meetings
 from sfmapp.simd.pointers import pointer
@@ -23,8 +24,8 @@ from sfmapp.simd.pointers import pointer
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Blocks of a cluster of the preconditioner: the columns of tiles that are summed at once.
-CLUSTER = 32
+# Blocks of a cluster of the preconditioner: the columns of tiles that are summed at once, all or none.
+CLUSTER = COLUMNS
 # A step of the model is wanted to this share at first, and to the last one near the minimum; the most rounds of a step.
 _LOOSE, _TIGHT, _MAX_ROUNDS = 0.1, 1e-3, 300
 

@@ -181,8 +181,9 @@ def adjusting_of(mapper: Mapper, positions: Positions | None = None) -> Adjustin
         chosen = mapper.robust(options) if is_robust else options
         unit = noise.sigma_px if chosen.loss == "trivial" else noise.robust_px
         made = FactorGraph(
-            mapper.reconstruction, chosen, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=unit
-        )
+            mapper.reconstruction, chosen, varying=varying, prior_cameras=mapper.prior_cameras, noise_px=unit,
+            threads=mapper.threads,
+        )  # fmt: skip
         if positions is not None:
             positions.add_to(made)
         return made

@@ -143,7 +143,7 @@ def _pose_model(number: int, mapper: Mapper, known: KnownPoses) -> PosedModel | 
     rigid = model.copy()
     optimized = adjusting_of(mapper).to_optimize()
     optimized.add(pose_graph(known, fit.sigma, fit.is_inlier))
-    optimized.optimize()
+    optimized.optimize(mapper.events)
     if growth_of_cost(rigid, model, mapper.noise.sigma_px) > MAX_COST_PER_NUMBER * 6 * int(fit.is_inlier.sum()):
         _restore(model, rigid)
         return replace(judged, row=replace(judged.row, is_adjusted=False))
@@ -155,7 +155,7 @@ def brought(mapper: Mapper, known: KnownPoses) -> tuple[float, PoseFit | None]:
     reckoned with; None if it cannot be."""
     model = mapper.reconstruction
     # what photographs alone make of one more adjustment is no doing of the poses
-    adjusting_of(mapper).to_optimize().optimize()
+    adjusting_of(mapper).to_optimize().optimize(mapper.events)
     first = robust_pose_fit(model.cam_from_world[known.image_idx], known)
     if first is None:
         return 1.0, None

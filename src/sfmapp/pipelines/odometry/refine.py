@@ -175,7 +175,7 @@ def adjusted(
     def adjust_once(num_steps: int) -> Round:
         before = model.obs_is_inlier.copy()
         chosen = round_options(adjust.robust(sigma_px), num_steps)
-        report = FactorGraph(model, chosen, prior_cameras=priors, noise_px=1.0).optimize()
+        report = FactorGraph(model, chosen, prior_cameras=priors, noise_px=1.0).optimize(events)
         events.decided(STAGE, f"closing adjustment: {report.text}", **report)
         limit_px = mapping.max_reprojection_error_sigmas * structure.residual_scale_px(model, _MIN_SIGMA_PX)
         limit_px = float(np.clip(limit_px, _MIN_LIMIT_PX, mapping.max_reprojection_error_px))
