@@ -117,14 +117,11 @@ def find_runs(meetings: Meetings, batches: Ints) -> tuple[Ints, Int32s, Int32s]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def mark_pairs(meetings: Meetings, pairs: NDArray[np.bool_], products: Ints) -> None:
-    """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point; products (G,) counts those of each
-    group of rows."""
+def mark_pairs(meetings: Meetings, pairs: NDArray[np.bool_]) -> None:
+    """Set pairs[a, b], (B, B) bool, for all blocks a <= b that meet in a point."""
     block = meetings.block
     for e in range(block.shape[0]):
-        first, last = meetings.partners[e]
-        products[block[e] // GROUP] += last - first
-        for m in range(first, last):
+        for m in range(meetings.partners[e, 0], meetings.partners[e, 1]):
             pairs[block[e], block[m]] = True
 
 

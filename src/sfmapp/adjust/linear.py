@@ -84,10 +84,17 @@ def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:
 
 def aligned_zeros(*shape: int) -> Array:
     """Zeros whose rows of eight start on cache lines: half the loads of tiles would straddle two otherwise."""
-    size = int(np.prod(shape))
-    raw = np.zeros(size + 8)
+    return _aligned(np.zeros(int(np.prod(shape)) + 8)).reshape(shape)
+
+
+def aligned_empty(size: int) -> Array:
+    """The same of any content."""
+    return _aligned(np.empty(size + 8))
+
+
+def _aligned(raw: Array) -> Array:
     start = (-raw.ctypes.data % 64) // 8
-    return raw[start : start + size].reshape(shape)
+    return raw[start : start + len(raw) - 8]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

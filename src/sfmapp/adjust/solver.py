@@ -31,6 +31,7 @@ from sfmapp.adjust.linear import (
     ReducedSystem,
     SolverName,
     TileSystem,
+    aligned_empty,
     aligned_zeros,
     assemble,
     choose_solver,
@@ -225,22 +226,13 @@ class Engine:
     def _arrange_tiles(self, is_closing: bool, may_iterate: bool) -> Ints:
         """Choose what solves, and the tiles that are kept; returns how many products each group of their rows sums."""
         p, blocks = self.problem, self.problem.num_blocks
-        met, products = np.eye(blocks, dtype=bool), np.zeros(-(-blocks // GROUP), np.int64)
-        mark_pairs(self.meetings, met, products)
-        other, second = p.camera_block[p.image_camera], p.second_block
-        shared = (p.image_block >= 0) & (other >= 0)
-        met[p.image_block[shared], other[shared]] = True
-        shared &= second[p.image_camera] >= 0
-        met[p.image_block[shared], second[p.image_camera[shared]]] = True
-        met[p.camera_block[second >= 0], second[second >= 0]] = True
-        if self.extras is not None:
-            met.reshape(-1)[self.extras.pairs] = True
-        is_small = blocks <= _MAX_DENSE_BLOCKS
-        keys = numbers = np.flatnonzero(met)
+        partners, is_small = self.meetings.partners, blocks <= _MAX_DENSE_BLOCKS
+        counts = np.bincount(self.meetings.block // GROUP, partners[:, 1] - partners[:, 0], -(-blocks // GROUP))
+        products, keys, order = counts.astype(np.int64), np.arange(blocks * blocks), None
         if blocks and (is_closing or not is_small):
+            keys = self._met_pairs()
             self.fill = 2 * len(keys) / (blocks * (blocks + 1))
             self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
-        order = None
         if self.solver == "envelope":
             from sfmapp.adjust.envelope import EnvelopeOrder, EnvelopeSystem  # loads scipy
 
@@ -252,10 +244,9 @@ class Engine:
                 self.solver = "iterative"
                 keys = keys[is_of_cluster(*np.divmod(keys, blocks))]
                 self.iterative = IterativeSystem(p.block_dim, keys, np.arange(len(keys)))
-        if is_small or self.solver == "tiles":
-            self.tile_keys = np.arange(blocks * blocks)
-        else:
-            self.tile_keys, numbers = keys, np.arange(len(keys))
+        self.has_all_tiles = is_small or self.solver == "tiles"
+        self.tile_keys = np.arange(blocks * blocks) if self.has_all_tiles else keys
+        numbers = keys if self.has_all_tiles else np.arange(len(keys))
         row, column = np.divmod(self.tile_keys, max(1, blocks))
         self.tile_rows = TileRows(np.searchsorted(row, np.arange(blocks + 1)), column)
         if self.solver == "gtsam":
@@ -267,6 +258,20 @@ class Engine:
         elif self.solver == "envelope":
             self.system = EnvelopeSystem(p.block_dim, keys, numbers, order)
         return products
+
+    def _met_pairs(self) -> Ints:
+        """Pairs of blocks a B + b, a <= b, that meet in a point, an image or a factor, ascending."""
+        p, met = self.problem, np.eye(self.problem.num_blocks, dtype=bool)
+        mark_pairs(self.meetings, met)
+        other, second = p.camera_block[p.image_camera], p.second_block
+        shared = (p.image_block >= 0) & (other >= 0)
+        met[p.image_block[shared], other[shared]] = True
+        shared &= second[p.image_camera] >= 0
+        met[p.image_block[shared], second[p.image_camera[shared]]] = True
+        met[p.camera_block[second >= 0], second[second >= 0]] = True
+        if self.extras is not None:
+            met.reshape(-1)[self.extras.pairs] = True
+        return np.flatnonzero(met)
 
     def _arrange_points(self, products: Ints) -> None:
         """Part points in batches of chunks, and groups of rows of tiles in parts that cost alike by their products."""
@@ -282,7 +287,7 @@ class Engine:
         self.shares = np.searchsorted(p.point_ptr, np.linspace(0, p.num_observations, self.num_chunks + 1))
         self.shares[0], self.shares[-1] = 0, num_points
         self.runs = Runs(*find_runs(self.meetings, batches))
-        self.point_rows = aligned_zeros(int(np.diff(ptr[batches]).max(initial=0)) * 24)
+        self.point_rows = aligned_empty(int(np.diff(ptr[batches]).max(initial=0)) * 24)
         num_parts = int(np.clip(products.sum() // _PART_PRODUCTS, 1, _MAX_PARTS))
         self.parts = np.searchsorted(np.cumsum(products), np.linspace(0, products.sum(), num_parts + 1))
         self.parts[0], self.parts[-1] = 0, len(products)
@@ -408,7 +413,7 @@ class Engine:
 
     def tile_numbers(self, keys: Ints) -> Ints:
         """Tiles of block pairs a B + b."""
-        return np.searchsorted(self.tile_keys, keys)
+        return keys if self.has_all_tiles else np.searchsorted(self.tile_keys, keys)
 
     def attempt(self, step: Array, run: Callable[..., Any]) -> tuple[float, float]:
         """Try a step: cost of the new state, and the decrease that the quadratic model predicts."""
