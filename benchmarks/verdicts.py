@@ -745,6 +745,12 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "another place, or one that looks the same, is not taken for one of a known map"
     good = [not row["known_map"].get("is_found") for row in outside]
     yield Promise("known_maps", text, sum(good), len(outside), date)
+    report = read(folder, "loops")
+    rows, date = report["rows"], report["date"][:10]
+    text = "no walk closes a loop to the like of a place, in halls of equal bays, rooms and blocks"
+    yield Promise("loops", text, sum(row["with"]["num_wrong"] == 0 for row in rows), len(rows), date)
+    text = "a walk that comes back to where it was closes a loop"
+    yield Promise("loops", text, sum(row["with"]["num_right"] > 0 for row in rows), len(rows), date)
     report = read(folder, "kidnapped")
     rows, date = [row for hall in report["halls"] for row in hall["rows"]], report["date"][:10]
     text = "a camera put down in a hall of look-alikes is where it is believed to be, or undecided; never surely wrong"

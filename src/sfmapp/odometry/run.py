@@ -481,6 +481,7 @@ class Odometry:
         if closure is None:
             return
         self.calibration.forget()
+        old_frame_idx = maps[closure.old_map].keyframes.keyframes[closure.views[-1].old_idx].frame_idx
         for number in {closure.old_map, closure.new_map}:
             maps[number].backend.finish(maps[number].keyframes)
         self.local, scale = self.recognition.close(maps, self.records, closure)
@@ -493,8 +494,8 @@ class Odometry:
         self.counts.loops += 1
         self._tell(
             "a loop is closed" if closure.old_map == closure.new_map else "two maps are joined", everything=True,
-            shift_in_depths=closure.shift, rotation_deg=closure.rotation_deg, scale=closure.scale,
-            num_inliers=list(closure.num_inliers), rms_px=closure.rms_px,
+            old_frame_idx=old_frame_idx, shift_in_depths=closure.shift, rotation_deg=closure.rotation_deg,
+            scale=closure.scale, num_inliers=list(closure.num_inliers), rms_px=closure.rms_px,
         )  # fmt: skip
 
     def _tell(self, message: str, everything: bool = False, **data: Any) -> None:

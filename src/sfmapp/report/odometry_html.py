@@ -267,8 +267,8 @@ def belief_text(row: BeliefReport) -> str:
 def _loops(decisions: Iterable[LogLine]) -> str:
     """The decisions that laid one part of a map on another."""
     head = [
-        ("", "frame"), ("t", "what"), ("", "shift, depths of the scene"), ("", "turn deg"), ("", "scale"),
-        ("", "inliers"), ("", "rms px"),
+        ("", "frame"), ("t", "what"), ("", "to frame"), ("", "shift, depths of the scene"), ("", "turn deg"),
+        ("", "scale"), ("", "inliers"), ("", "rms px"),
     ]  # fmt: skip
     rows = []
     for line in decisions:
@@ -276,7 +276,8 @@ def _loops(decisions: Iterable[LogLine]) -> str:
         if "shift_in_depths" in data:
             numbers = [f"{data['shift_in_depths']:.3g}", f"{data['rotation_deg']:.2f}", f"{data['scale']:.4f}"]
             inliers = ", ".join(map(str, np.atleast_1d(data["num_inliers"])))
-            texts = [*numbers, inliers, f"{data['rms_px']:.2f}"]
+            old = int(data["old_frame_idx"])
+            texts = [str(old) if old >= 0 else "the known map", *numbers, inliers, f"{data['rms_px']:.2f}"]
             rows.append([("", data["frame_idx"]), ("t", line.message), *(("", text) for text in texts)])
     return "<h2>Loops and joined maps</h2>" + table(head, rows) if rows else ""
 
