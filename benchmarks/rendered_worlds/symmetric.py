@@ -125,6 +125,29 @@ def kidnapping(world_seed: int, seed: int, num_frames: int, start: Array, yaw: f
     return _played("kidnapped", world_seed, way, pose, seed)
 
 
+def drive_past_corner(world_seed: int, seed: int) -> RenderedSequence:
+    """On the way round the hall from anywhere, for 60 frames at least, until the corner that has no like is 3 m behind.
+
+    The camera looks ahead and outwards by turns of its own, beside the way of the map.
+    """
+    rng = np.random.default_rng([seed, 0x5E7A])
+    arc = np.pi * _RADIUS_M
+    lap, behind = 4 * _STRAIGHT_M + 2 * arc, _STRAIGHT_M + arc + 3.0
+    first = rng.uniform(0.0, lap)
+    length = (behind - first) % lap
+    length += lap if length < 60 * STEP_M else 0.0
+    aside, phase = rng.uniform(-0.4, 0.4), rng.uniform(0, 2 * np.pi, 3)
+
+    def pose(times: Array) -> Array:
+        s = first + times * FRAMES_PER_SECOND * STEP_M
+        x, y, yaw = _on_way(s % lap)
+        x, y = x - aside * np.sin(yaw), y + aside * np.cos(yaw)
+        z = 1.6 + 0.06 * np.sin(1.7 * s + phase[1])
+        return _poses(x, y, z, yaw - 0.5 + 0.45 * np.sin(1.9 * s + phase[0]), 0.03 * np.sin(1.1 * s + phase[2]))
+
+    return _played("past the corner", world_seed, np.arange(0.0, length, STEP_M), pose, seed)
+
+
 def turned_half(cam_from_world: Array) -> Array:
     """Poses (N, 7) at the like of a place: half a turn about the middle of the hall."""
     return rigid3.compose(cam_from_world, np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]))

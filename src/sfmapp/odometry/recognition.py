@@ -68,6 +68,11 @@ class Recognition:
         """How many keyframes are remembered."""
         return len(self._places)
 
+    @property
+    def num_open_loops(self) -> int:
+        """Loops that were seen and not believed, as they may lead to the like of their place."""
+        return self._finder.num_open
+
     def know(self, local: LocalMap) -> None:
         """Remember the keyframes of a map that was there before, as far as there are pictures of them."""
         for position, picture in local.known.pictures.items():

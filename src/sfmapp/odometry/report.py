@@ -69,6 +69,7 @@ class OdometryReport(Report):
     Attributes:
         num_keyframes: of each map.
         tracking_cpu_s, backend_cpu_s: CPU seconds of tracking and of local adjustment.
+        loops_open: that were seen and not closed, as what they show may be elsewhere as well.
         looked_still, looked_turned: frames in which the camera seemed to stand still, or to turn on the spot, before
             there was a map. twins: frames of a map that showed what the one before showed.
         right_late_frames: by how many frames the images of the second camera came late.
@@ -85,6 +86,7 @@ class OdometryReport(Report):
     relocalizations: int
     losses: int
     loops: int
+    loops_open: int
     keyframes_culled: int
     looked_still: int
     looked_turned: int

@@ -593,7 +593,7 @@ class Odometry:
             tracking_cpu_s=sum(record.cpu_s for record in self.records),
             backend_cpu_s=sum(local.backend.cpu_s for local in self.atlas), **asdict(self.counts),
             right_late_frames=self.clock.shift, pairs=self.clock.contradictions(),
-            known_map=known_map,
+            known_map=known_map, loops_open=self.recognition.num_open_loops,
         )  # fmt: skip
 
 

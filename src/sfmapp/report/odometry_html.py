@@ -50,7 +50,8 @@ def render_odometry_html(
     body.append(_maps(report.maps) + _ground_truth(report.ground_truth))
     if report.stages.odometry is not None and report.stages.odometry.known_map is not None:
         body.append(_known_map(report.stages.odometry.known_map))
-    body.append(_loops(report.decisions) + _sequence(report.sequence, report.stages))
+    num_open = 0 if report.stages.odometry is None else report.stages.odometry.loops_open
+    body.append(_loops(report.decisions, num_open) + _sequence(report.sequence, report.stages))
     body.append(adjustment_table((f"map {row.idx}", row.adjustment) for row in report.maps))
     body.append(
         _live(report.live)
@@ -264,8 +265,8 @@ def belief_text(row: BeliefReport) -> str:
     return f"{looked}: undecided. It may be near {shown}, or in none of its places ({row.not_in_map:.2g})."
 
 
-def _loops(decisions: Iterable[LogLine]) -> str:
-    """The decisions that laid one part of a map on another."""
+def _loops(decisions: Iterable[LogLine], num_open: int) -> str:
+    """The decisions that laid one part of a map on another, and how many loops were left open."""
     head = [
         ("", "frame"), ("t", "what"), ("", "to frame"), ("", "shift, depths of the scene"), ("", "turn deg"),
         ("", "scale"), ("", "inliers"), ("", "rms px"),
@@ -279,7 +280,8 @@ def _loops(decisions: Iterable[LogLine]) -> str:
             old = int(data["old_frame_idx"])
             texts = [str(old) if old >= 0 else "the known map", *numbers, inliers, f"{data['rms_px']:.2f}"]
             rows.append([("", data["frame_idx"]), ("t", line.message), *(("", text) for text in texts)])
-    return "<h2>Loops and joined maps</h2>" + table(head, rows) if rows else ""
+    text = f"<p>{num_open} more seen and left open: what they show may be elsewhere as well.</p>" if num_open else ""
+    return "<h2>Loops and joined maps</h2>" + (table(head, rows) if rows else "") + text if rows or num_open else ""
 
 
 def _sequence(sequence: SequenceReport, stages: OdometryStages) -> str:

@@ -132,10 +132,14 @@ class _Suspicion:
 
 
 class LoopFinder:
-    """Looks for loops at every keyframe. What it finds depends on the order of the calls alone."""
+    """Looks for loops at every keyframe. What it finds depends on the order of the calls alone.
+
+    Attributes:
+        num_open: loops that were seen often enough and may lead to the like of their place.
+    """
 
     def __init__(self, options: LoopOptions = LoopOptions()) -> None:
-        self.options = options
+        self.options, self.num_open = options, 0
         self._suspicion: _Suspicion | None = None
 
     @property
@@ -244,6 +248,10 @@ class LoopFinder:
         keyframes, newest = maps[map_idx], trial.views[-1].new_idx
         shift = trial.shift(keyframes) / keyframe_depths(keyframes)[newest] if trial.old_map == map_idx else None
         is_certain = agrees and trial.is_certain(shift)
+        if num == options.min_views:
+            self.num_open += agrees and not is_certain
+        else:  # it has been open
+            self.num_open -= is_certain
         if is_certain or not agrees or num >= options.max_views:
             self._suspicion = None
         return self._closure(maps, map_idx, trial) if is_certain else None
