@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 STILL = Optics(exposure_s=0.0, sub_exposures=1)
 INDOORS = Camera(CameraModel.PINHOLE, 320, 240, np.array([262.5, 262.5, 160.0, 120.0]))
-ROAD = Camera(CameraModel.PINHOLE, 620, 188, np.array([359.4, 359.4, 303.8, 92.9]))
+ROAD = Camera(CameraModel.PINHOLE, 620, 188, np.array([359.428, 359.428, 303.8464, 92.85785]))
 # Keyframes on each side of the old one that tell its unit of length.
 _NEAR = 8
 
@@ -52,8 +52,7 @@ def find_cases() -> Iterator[tuple[str, int, RenderedSequence]]:
         yield "hall of equal bays, two rounds", seed, symmetric.walk_round(seed, 2.0)
     for seed in range(4):
         yield "room", seed, sequences.room(1000, seed, STILL, INDOORS)
-    for seed in (0, 2):
-        yield "block", seed, sequences.street(620, seed, STILL, Rig.single(ROAD))
+    yield "block", 0, sequences.street(620, 0, STILL, Rig.single(ROAD))
 
 
 def play(rendered: RenderedSequence, loops: bool) -> dict[str, Any]:

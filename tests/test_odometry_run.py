@@ -160,7 +160,7 @@ def test_the_frame_at_which_worlds_change_has_its_live_pose_in_the_new_one(monke
             return None
         seen.append(view.frame_idx)
         empty = SimpleNamespace(old_map=local.map_idx, new_map=local.map_idx, shift=0.0, rotation_deg=0.0, scale=1.7)
-        return SimpleNamespace(**vars(empty), num_inliers=(1,), rms_px=0.1)
+        return SimpleNamespace(**vars(empty), num_inliers=(1,), rms_px=0.1, views=[SimpleNamespace(old_idx=0)])
 
     def close(self: Recognition, maps: dict[int, LocalMap], records: list[FrameRecord], closure: Any) -> Any:
         local = maps[closure.new_map]
