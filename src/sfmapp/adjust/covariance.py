@@ -245,6 +245,16 @@ def similarity_basis(poses: Array) -> tuple[Array, Array]:
     return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
 
 
+def moves_into_gauge(basis: Array, constraint: Array) -> Array:
+    """(k, N) how much of each freedom takes errors (N,) into the gauge of a constraint: they are there without
+    ``basis.T @ (moves @ errors)``, as in inner constraints (Triggs et al., "Bundle Adjustment", 1999, section 9).
+
+    Args:
+        basis: (k, N) what the freedoms do. constraint: (k, N) rows whose products with errors vanish in the gauge.
+    """
+    return np.asarray(np.linalg.solve(constraint @ basis.T, constraint), np.float64)
+
+
 def gauge_of(
     problem: Problem, used: Mask, information: Array, scale: Array, *, has_factors: bool
 ) -> tuple[Array, Array]:
@@ -455,7 +465,7 @@ def moved_to_gauge(
         poses = wanted.distinct_poses(images)[0]
         basis, constraint = (rows[:freedoms] for rows in similarity_basis(poses))
         move = np.zeros(7)
-        move[:freedoms] = np.linalg.solve(constraint @ basis.T, constraint @ _pose_errors(reached, poses).ravel())
+        move[:freedoms] = moves_into_gauge(basis, constraint) @ _pose_errors(reached, poses).ravel()
         _apply_similarity(wanted, poses, move)
         if np.abs(move).max() < 1e-14:
             break

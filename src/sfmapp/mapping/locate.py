@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import moved_to_gauge, similarity_basis
+from sfmapp.adjust.covariance import moved_to_gauge, moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.pose import refine_pose
@@ -387,7 +387,7 @@ def _in_frame_of_others(graph: FactorGraph, around: Reconstruction, query: int) 
     basis = similarity_basis(around.cam_from_world[images])[0]
     constraint = np.zeros_like(basis)
     constraint[:, :-6] = similarity_basis(around.cam_from_world[images[:-1]])[1]
-    moved = np.eye(basis.shape[1]) - basis.T @ np.linalg.solve(constraint @ basis.T, constraint)
+    moved = np.eye(basis.shape[1]) - basis.T @ moves_into_gauge(basis, constraint)
     covariance: Array = (moved @ marginal.matrix @ moved.T)[-6:, -6:]
     return covariance
 

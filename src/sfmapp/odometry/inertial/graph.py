@@ -26,7 +26,7 @@ import numpy as np
 from gtsam.symbol_shorthand import A, B, M, V, X
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.covariance import moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustReport
 from sfmapp.adjust.problem import Varying
@@ -306,7 +306,7 @@ class _Graph:
         basis, constraint = similarity_basis(poses)
         if self._seen.is_metric:
             basis, constraint = basis[:6], constraint[:6]
-        move = np.asarray(np.linalg.solve(constraint @ basis.T, constraint), np.float64)
+        move = moves_into_gauge(basis, constraint)
         of_alignment = np.zeros((4, 6 * len(poses)))
         # a map that turns and grows turns and shrinks against the world: rows of turns are about the map's axes
         of_alignment[1:3] = (self._place.world_from_map @ move[:3])[:2]

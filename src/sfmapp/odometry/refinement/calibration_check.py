@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.calibration import RAW, CalibrationSystem, reduce_to_calibration
-from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.covariance import moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
@@ -514,7 +514,7 @@ def _refined(look: _Look, doubtful: Array, unknowns: Unknowns, report: Calibrati
     poses, freedoms = look.model.cam_from_world[::num_sensors], 6 if num_sensors > 1 else 7
     basis, constraint = (rows[:freedoms] for rows in similarity_basis(poses))
     moved = look.system.response[:, :, :num].reshape(-1, num)
-    moved = moved - basis.T @ np.linalg.solve(constraint @ basis.T, constraint @ moved)
+    moved = moved - basis.T @ (moves_into_gauge(basis, constraint) @ moved)
     by_frame = moved.reshape(-1, 6, num)
     open_ = by_frame @ look.covariance @ by_frame.transpose(0, 2, 1)
     excess = max(1.0, float(np.abs(look.x / unknowns.sigmas).max()) / _PRIOR_SIGMAS)

@@ -19,7 +19,7 @@ import numpy as np
 from gtsam.symbol_shorthand import G, X
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.covariance import moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
@@ -252,7 +252,7 @@ def _varying(model: Reconstruction, num_sensors: int) -> Varying:
 def _in_gauge(joint: Array, poses: Array, is_metric: bool) -> Array:
     """(K, 6, 6) covariances with the map held by all keyframes, out of (6 K, 6 K) with it held otherwise."""
     basis, constraint = (rows[: 6 if is_metric else 7] for rows in similarity_basis(poses))
-    change = np.eye(len(joint)) - basis.T @ np.linalg.solve(constraint @ basis.T, constraint)
+    change = np.eye(len(joint)) - basis.T @ moves_into_gauge(basis, constraint)
     found = (change @ joint @ change.T).reshape(len(poses), 6, len(poses), 6)
     return np.asarray(found[np.arange(len(poses)), :, np.arange(len(poses))], np.float64)
 
