@@ -11,25 +11,23 @@ the dinosaur and the temple chose nothing.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from machine import RESULTS, ROOT, describe_machine
+from machine import ROOT
 
 sys.path.insert(0, str(ROOT / "tests"))
 
 from carving import DATA, DINOSAUR, iou, load
 from carving_scenes import Solid as ExactSolid
 from carving_scenes import around, ball, both, box, ring, silhouette_of, without
+from cases import measure_cases
 from rendered_worlds.lit_solids import Rig, drawn, house, jug, looking_in
 from rendered_worlds.lit_solids import around as all_round
 from rendered_worlds.solids import Lamps, Solid, render
@@ -174,22 +172,7 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "carving_tolerance.json")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="measure these, and keep what is there of the others")
-    args = parser.parse_args()
-    told = json.loads(args.output.read_text())["rows"] if args.only and args.output.is_file() else []
-    rows = {case: [row for row in told if row["case"] == case] for case in SCENES}
-    for case in args.only or SCENES:
-        rows[case] = []
-        for row in measured(case, case in MADE_ON, *SCENES[case]()):
-            rows[case].append(row)
-            print(json.dumps(row), flush=True)
-        report = describe_machine() | {"rows": [row for each in rows.values() for row in each]}
-        args.output.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        args.output.with_suffix(".md").write_text(markdown(report), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    measure_cases(
+        "carving_tolerance", __doc__, SCENES, lambda case: measured(case, case in MADE_ON, *SCENES[case]()), markdown
+    )

@@ -11,12 +11,8 @@ upside down, or without the half to one side.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from carving import BUNNY, BUNNY_CAMERA, DATA, DINOSAUR, load
 from carving_tolerance import WIDTH, Scene, rendered
-from machine import RESULTS, describe_machine
+from cases import measure_cases
 from rendered_worlds.lit_solids import around, drawn
 from sfmapp.carve.box import find_box
 from sfmapp.carve.outlines import Silhouette, coverage_of_mask, signed_distance
@@ -166,20 +162,5 @@ def markdown(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "carving_wrong_views.json")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="measure these, and keep what is there of the others")
-    args = parser.parse_args()
-    earlier = json.loads(args.output.read_text())["rows"] if args.only and args.output.is_file() else []
-    rows = {case: [row for row in earlier if row["case"] == case] for case in CASES}
-    for case in args.only or CASES:
-        rows[case] = list(measured(case))
-        print(case, sum(row["named"] for row in rows[case]), "of", len(rows[case]), file=sys.stderr, flush=True)
-        report = describe_machine() | {"rows": [row for each in rows.values() for row in each]}
-        args.output.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        args.output.with_suffix(".md").write_text(markdown(report), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    measure_cases("carving_wrong_views", __doc__, CASES, measured, markdown)

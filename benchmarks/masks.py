@@ -9,8 +9,6 @@ is told the rectangle around the true mask, which nobody knows in practice; ours
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from collections.abc import Iterator
@@ -22,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from machine import RESULTS, describe_machine
+from cases import measure_cases
 from rendered_worlds.lit_solids import around, drawn
 from rendered_worlds.solids import photograph
 from rendered_worlds.turntables import seen_in
@@ -120,7 +118,7 @@ def measured(case: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# Masks by shared colours", "", (__doc__ or "").split("\n\n")[1].replace("\n", " "), "",
         "| case | chose | IoU, ours | GrabCut, true rectangle | wrong far from the outline | CPU ms, ours | GrabCut |",
@@ -130,24 +128,10 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         f"| {r['case']} | {'no' if r['fresh'] else 'yes'} | {r['iou']:.3f} (least {r['least_iou']:.3f}) | "
         f"{r['peer_iou']:.3f} ({r['peer_least_iou']:.3f}) | {r['wrong_far']:.2%} | {r['cpu_ms']:.0f} | "
         f"{r['peer_cpu_ms']:.0f} |"
-        for r in rows
+        for r in report["rows"]
     ]
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="measure these, and keep what is there of the others")
-    only = parser.parse_args().only
-    path = RESULTS / "masks.json"
-    rows = {row["case"]: row for row in json.loads(path.read_text())["rows"]} if only else {}
-    for case in only or CASES:
-        rows[case] = measured(case)
-        print(json.dumps(rows[case]), flush=True)
-        kept = [rows[name] for name in CASES if name in rows]
-        path.write_text(json.dumps({**describe_machine(), "rows": kept}, indent=1) + "\n")
-        path.with_suffix(".md").write_text(markdown(kept))
-
-
 if __name__ == "__main__":
-    main()
+    measure_cases("masks", __doc__, CASES, lambda case: [measured(case)], markdown)

@@ -10,8 +10,6 @@ revolution but for a handle: unless they are painted they look the same from all
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from pathlib import Path
@@ -19,7 +17,7 @@ from typing import Any
 
 import cv2
 
-from machine import RESULTS, describe_machine
+from cases import measure_cases
 from masks import by_rectangle, scores
 from rendered_worlds.lit_solids import drawn, house, jug
 from rendered_worlds.turntables import Conditions, Turntable, turned
@@ -96,7 +94,7 @@ def measured(case: str) -> dict[str, Any]:
     return row
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# Masks before a background that stands still", "", (__doc__ or "").split("\n\n")[1].replace("\n", " "), "",
         "IoU, in brackets the least of a set.", "",
@@ -104,7 +102,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         "GrabCut, true rectangle | warned | CPU ms |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
-    for row in rows:
+    for row in report["rows"]:
         told = [
             f"{row[name]['iou']:.3f} ({row[name]['least']:.3f})" if name in row else "-"
             for name in ("told nothing", "with cameras", "given the background")
@@ -118,20 +116,5 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "masks_still.json")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="measure these, and keep what is there of the others")
-    args = parser.parse_args()
-    told = json.loads(args.output.read_text())["rows"] if args.output.is_file() else []
-    rows = {row["case"]: row for row in told if args.only and row["case"] in CASES}
-    for case in args.only or CASES:
-        rows[case] = measured(case)
-        print(json.dumps(rows[case]), flush=True)
-        kept = [rows[name] for name in CASES if name in rows]
-        args.output.write_text(json.dumps({**describe_machine(), "rows": kept}, indent=1) + "\n")
-        args.output.with_suffix(".md").write_text(markdown(kept))
-
-
 if __name__ == "__main__":
-    main()
+    measure_cases("masks_still", __doc__, CASES, lambda case: [measured(case)], markdown)
