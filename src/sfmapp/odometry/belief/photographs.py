@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, project
 from sfmapp.geometry import rigid3
+from sfmapp.mapping.near_views import MAX_ANGLE_DEG, MAX_ZOOM
 from sfmapp.odometry.loops.evidence import Score, Tally
 from sfmapp.odometry.loops.place_recognition import SIGMA_PX, View
-from sfmapp.odometry.loops.relocalize import LocalPoints, agreeing_at
+from sfmapp.odometry.loops.relocalize import LocalPoints, agreeing_at, sight_change
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -24,8 +25,8 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
 # Landmarks are expected where a photograph of the model has seen them from about the same side, in about the same size:
-# within what descriptors bear, and near enough for nothing to have come between (mapping.near_views).
-_MAX_ASIDE_DEG, _SIZES = 15.0, (1 / 1.5, 1.5)
+# within what descriptors bear, and near enough for nothing to have come between.
+_MIN_COS, _SIZES = math.cos(math.radians(MAX_ANGLE_DEG)), (1 / MAX_ZOOM, MAX_ZOOM)
 # Photographs that landmarks are described in, and landmarks that are asked for.
 _NUM_PHOTOGRAPHS, _MAX_EXPECTED = 6, 400
 # Share of clusters that are hidden or have changed in a right place, for a place that is known to have its likes, where
@@ -74,11 +75,9 @@ def _expected(model: Reconstruction, pose: Array, camera: Camera) -> Ints:
     xyz, image = model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_image_idx[obs]
     expected = project(camera, rigid3.apply(pose, xyz))
     focal = np.array([c.focal for c in model.cameras])[model.image_camera_idx[image]]
-    before, now = model.centers[image] - xyz, rigid3.center(pose) - xyz
-    far, near = np.linalg.norm(before, axis=1), np.linalg.norm(now, axis=1)
-    aside = (before * now).sum(1) / np.maximum(far * near, 1e-300)
+    aside, far, near = sight_change(xyz, model.centers[image], rigid3.center(pose))
     size = camera.focal / focal * far / np.maximum(near, 1e-300)
-    chosen = (aside > math.cos(math.radians(_MAX_ASIDE_DEG))) & (size > _SIZES[0]) & (size < _SIZES[1])
+    chosen = (aside > _MIN_COS) & (size > _SIZES[0]) & (size < _SIZES[1])
     chosen &= ((expected > 0) & (expected < [camera.width, camera.height])).all(1)  # False for NaN
     count = np.bincount(image[chosen], minlength=len(model.image_names))
     most = np.argsort(-count, kind="stable")[:_NUM_PHOTOGRAPHS]

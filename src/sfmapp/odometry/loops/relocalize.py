@@ -346,14 +346,19 @@ def seen_as_before(keyframes: KeyframeMap, local: LocalPoints, pose: Array) -> M
     """(M,) which points are seen from a pose (7,) from a side and a distance as from their keyframes."""
     owner, row = np.unique(local.keyframe_idx, return_inverse=True)
     centers = rigid3.center(np.array([keyframes.keyframes[k].rig_from_world for k in owner]).reshape(-1, 7))
-    before, now = centers[row] - local.xyz, rigid3.center(pose) - local.xyz
-    far, near = np.linalg.norm(before, axis=1), np.linalg.norm(now, axis=1)
-    aside = (before * now).sum(1) / np.maximum(far * near, 1e-300)
+    aside, far, near = sight_change(local.xyz, centers[row], rigid3.center(pose))
     share = near / np.maximum(far, 1e-300)
     is_seen: Mask = (
         (aside > math.cos(math.radians(_MAX_ASIDE_DEG))) & (share > _DISTANCE_SHARES[0]) & (share < _DISTANCE_SHARES[1])
     )
     return is_seen
+
+
+def sight_change(xyz: Array, before: Array, now: Array) -> tuple[Array, Array, Array]:
+    """(N,) cosines between the rays to points (N, 3) from centres before and now, (N, 3) or (3,), and the distances."""
+    back, forth = before - xyz, now - xyz
+    far, near = np.linalg.norm(back, axis=1), np.linalg.norm(forth, axis=1)
+    return (back * forth).sum(1) / np.maximum(far * near, 1e-300), far, near
 
 
 def twist(rotation: Array, other: Array) -> Array:

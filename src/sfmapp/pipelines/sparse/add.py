@@ -36,11 +36,10 @@ from sfmapp.pipelines.sparse.finished import (
     uncertainty_of,
 )
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
-from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.photographs import PHOTOGRAPHS, as_before, link_photographs, with_new
 from sfmapp.pipelines.sparse.reconstruct import RunResult, check_enough, map_and_report
 from sfmapp.pipelines.sparse.run import Before, Run
-from sfmapp.pipelines.sparse.world import read_control, read_known_poses
+from sfmapp.pipelines.sparse.world import read_world
 from sfmapp.report.model import AddedPhotograph, AddedReport, ReconstructionReport
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
@@ -141,10 +140,7 @@ def _run(
         image_set, images, of_before = _all_photographs(run, folder, manifest, new, old_names)
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
-    run.control = read_control(run, run.image_set)
-    run.poses = read_known_poses(run, run.image_set)
-    run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
-    keys = stage_keys(run.options, run.image_set, run.control, run.poses)
+    keys = read_world(run, run.image_set)
     database = run.workspace.database
     if not database.is_file():
         beside = database.with_suffix(".copy")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,7 @@ from sfmapp.report.located_html import LandmarksReport, LocatedPhotographReport,
 from sfmapp.report.model import RunUsage
 from sfmapp.reporting import Usage, document_text
 from sfmapp.scene.features import Features
+from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.workspace.job import Job
 from sfmapp.workspace.kernels import kernels_compiling
 from sfmapp.workspace.layout import LOCATE, PAGE, REPORT
@@ -77,6 +79,15 @@ class _Search:
     events: Events
     pool: ThreadPoolExecutor
     unit: str
+
+    @cached_property
+    def small_model(self) -> Reconstruction:
+        """The model with cameras and observations in pixels of the pictures in which landmarks are looked for."""
+        model = self.finished.known.model
+        shrunk = [_shrunk(camera) for camera in model.cameras]
+        share = np.array([(s.width / c.width, s.height / c.height) for s, c in zip(shrunk, model.cameras, strict=True)])
+        xy = model.tracks.obs_xy * share[model.image_camera_idx[model.tracks.obs_image_idx]]
+        return replace(model, cameras=shrunk, tracks=replace(model.tracks, obs_xy=xy))
 
 
 def locate_photographs(
@@ -217,15 +228,11 @@ def _landmarks(search: _Search, record: ImageRecord, lens: Camera, pose: NDArray
     root, model = image_root(search.finished.manifest), search.finished.known.model
     if root is None or lens.is_wide or any(camera.is_wide for camera in model.cameras):
         return None
-    shrunk = [_shrunk(camera) for camera in model.cameras]
-    share = np.array([(s.width / c.width, s.height / c.height) for s, c in zip(shrunk, model.cameras, strict=True)])
-    tracks = model.tracks
-    xy = tracks.obs_xy * share[model.image_camera_idx[tracks.obs_image_idx]]
-    small = replace(model, cameras=shrunk, tracks=replace(tracks, obs_xy=xy))
+    small = search.small_model
 
     def picture_of(image: int) -> NDArray[np.uint8] | None:
         records, _ = describe_images(root, [model.image_names[image]], ImageOptions(), threads=1)
-        return None if records[0] is None else _picture(records[0], shrunk[model.image_camera_idx[image]])
+        return None if records[0] is None else _picture(records[0], small.cameras[model.image_camera_idx[image]])
 
     camera = _shrunk(lens)
     return judge_place(small, pose, camera, _picture(record, camera), picture_of)

@@ -34,11 +34,10 @@ from sfmapp.pipelines.sparse.finished import (
     uncertainty_of,
 )
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
-from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.photographs import PHOTOGRAPHS, as_before, link_photographs, with_new
 from sfmapp.pipelines.sparse.reconstruct import RunResult, map_and_report
 from sfmapp.pipelines.sparse.run import Before, Run
-from sfmapp.pipelines.sparse.world import read_control, read_known_poses
+from sfmapp.pipelines.sparse.world import read_world
 from sfmapp.report.model import MergedReport, ReconstructionReport
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.viewer.listener import RecordingListener
@@ -155,9 +154,7 @@ def _run(run: Run, sides: Sequence[_Side]) -> ReconstructionReport:
         records = _records(run, sides, new_name)
         run.image_set, befores = _union(sides, new_name, *records)
         run.image_set = with_positions(run.image_set, run.options.gps)
-    run.control, run.poses = read_control(run, run.image_set), read_known_poses(run, run.image_set)
-    run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
-    keys = stage_keys(run.options, run.image_set, run.control, run.poses)
+    keys = read_world(run, run.image_set)
     run.note_inputs(keys.inputs)
     known = _take_over(run, sides, new_name, befores, keys)
     run.before = Before(0, known, [first.model, renamed], is_apart=True)

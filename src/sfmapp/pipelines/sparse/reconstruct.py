@@ -16,11 +16,10 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.georeference.sources import with_positions
 from sfmapp.images.load import Images, load_images, name_of
 from sfmapp.pipelines.sparse import results
-from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
-from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
+from sfmapp.pipelines.sparse.keys import StageKeys
 from sfmapp.pipelines.sparse.matches import find_matches
 from sfmapp.pipelines.sparse.run import Run
-from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_control, read_known_poses
+from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_world
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.layout import RECONSTRUCT
 from sfmapp.workspace.options import Options
@@ -98,10 +97,7 @@ def _run(run: Run) -> ReconstructionReport:
         image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
-    run.control = read_control(run, run.image_set)
-    run.poses = read_known_poses(run, run.image_set)
-    run.known = parse_known_lengths(run.options.units.known, run.image_set.names)
-    keys = stage_keys(run.options, run.image_set, run.control, run.poses)
+    keys = read_world(run, run.image_set)
     if report := results.earlier_report(run, keys):
         return report
     if added := run.workspace.manifest.added:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from sfmapp.errors import UsageError
 from sfmapp.formats.control_points import ControlPoints, read_control_points
+from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
+from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
 
 if TYPE_CHECKING:
@@ -16,6 +18,19 @@ if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
     from sfmapp.mapping.known_poses import HeldPoses
     from sfmapp.mapping.mapper import Mapper
+
+
+def read_world(run: Run, image_set: ImageSet) -> StageKeys:
+    """Read what places the run's photographs in the world, and return the keys of its stages, which depend on it.
+
+    Raises:
+        InputError, MissingPackageError, UsageError: as of :func:`read_control` and :func:`read_known_poses`, and where
+            a known length is not what it has to be.
+    """
+    run.control = read_control(run, image_set)
+    run.poses = read_known_poses(run, image_set)
+    run.known = parse_known_lengths(run.options.units.known, image_set.names)
+    return stage_keys(run.options, image_set, run.control, run.poses)
 
 
 def read_control(run: Run, image_set: ImageSet) -> ControlPoints | None:
