@@ -42,6 +42,7 @@ FLOORS = (
     ("matching",),
     ("features",),
     ("sequences",),
+    ("cluster",),
     ("images",),
     ("camera_files",),
     ("formats",),
@@ -52,7 +53,7 @@ FLOORS = (
     ("simd",),
     ("contradictions",),
     ("events", "option_checks"),
-    ("packages",),
+    ("executor", "packages"),
     ("errors", "children", "kernel_cache"),
     ("reporting",),
 )
@@ -85,6 +86,7 @@ INNER_FLOORS = {
 }
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 ALLOWED = {
+    "distributed": {"cluster"},
     "rerun": {"viewer"},
     "gtsam": {"adjust", "georeference", "odometry"},
     "pycolmap": {"formats", "evaluation"},
@@ -228,7 +230,17 @@ def test_library_does_not_print_exit_or_configure_logging() -> None:
 
 def test_every_room_has_a_floor() -> None:
     rooms = {path.parent.name for path in SOURCE.glob("*/__init__.py")}
-    alone = {"contradictions", "events", "option_checks", "packages", "errors", "children", "kernel_cache", "reporting"}
+    alone = {
+        "contradictions",
+        "events",
+        "option_checks",
+        "packages",
+        "errors",
+        "children",
+        "kernel_cache",
+        "reporting",
+        "executor",
+    }
     assert rooms | alone == set(LEVEL)
 
 

@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from sfmapp.cli.progress import JsonLines, PlainLines
 from sfmapp.events import Event, Events
 
 # what takes time and memory to load, and what an ordinary reconstruction does without
-NOT_NEEDED = ("gtsam", "http.client", "pyproj", "rerun", "scipy.linalg", "scipy.sparse", "scipy.spatial")
+NOT_NEEDED = ("distributed", "gtsam", "http.client", "pyproj", "rerun", "scipy.linalg", "scipy.sparse", "scipy.spatial")
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 
 
@@ -140,12 +139,10 @@ def test_a_reader_that_leaves_early_is_no_failure() -> None:
 
 
 def test_the_second_run_says_that_there_is_nothing_to_do(photos: Path, finished: Path) -> None:
-    start = time.monotonic()
     done = command("reconstruct", photos, "-o", finished, "--no-recording")
     assert done.returncode == 0
     assert "up to date: nothing to do" in done.stdout
     assert "features" not in done.stderr
-    assert time.monotonic() - start < 10  # one on an idle machine
 
 
 def test_json_gives_one_document_and_events_as_lines(photos: Path, finished: Path) -> None:

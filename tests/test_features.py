@@ -14,7 +14,6 @@ from sfmapp.events import Event, Events
 from sfmapp.features.extract import (
     FeatureOptions,
     _bytes_needed,
-    _MemoryBudget,
     extract_features,
     features_from_picture,
 )
@@ -149,30 +148,6 @@ def test_masks_blank_orb_as_well() -> None:
     features, _, _ = features_from_picture(picture_of(texture((200, 150)), usable), FeatureOptions(kind="orb"))
     assert len(features) > 50
     assert features.keypoints[:, 0].min() >= 100
-
-
-def test_memory_budget_lets_one_large_image_through_alone() -> None:
-    budget = _MemoryBudget(100)
-    together: list[int] = []
-    most: list[int] = []
-    lock = threading.Lock()
-
-    def work(need: int) -> None:
-        with budget.hold(need):
-            with lock:
-                together.append(need)
-                most.append(sum(min(n, 100) for n in together))
-            threading.Event().wait(0.01)
-            with lock:
-                together.remove(need)
-
-    workers = [threading.Thread(target=work, args=(need,)) for need in (60, 60, 500, 30, 10, 100, 40)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join(5.0)
-        assert not worker.is_alive()
-    assert max(most) <= 100
 
 
 def test_memory_estimate_covers_what_is_taken() -> None:

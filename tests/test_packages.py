@@ -54,7 +54,7 @@ def test_the_command_asks_for_the_versions_of_the_project() -> None:
     for distribution, _ in packages._DISTRIBUTIONS.values():
         found = packages._requirement(distribution).replace(" ", "")
         extras = project["optional-dependencies"]
-        named = project["dependencies"] + extras["bags"] + extras["geo"]
+        named = project["dependencies"] + extras["bags"] + extras["cluster"] + extras["geo"]
         (mine,) = (r for r in named if r.partition(">")[0] == distribution)
         # pip and hatchling write the bounds in orders of their own
         assert set(found.replace(distribution, "").split(",")) == set(mine.replace(distribution, "").split(","))

@@ -13,6 +13,7 @@ BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 _DISTRIBUTIONS = {
     "av": ("av", "reading videos"),
     "cv2": ("opencv-contrib-python-headless", "reading images"),
+    "distributed": ("distributed", "work on a cluster"),
     "gtsam": ("gtsam", "adjusting with further factors"),
     "laspy": ("laspy[lazrs]", "writing LAS"),
     "lazrs": ("laspy[lazrs]", "writing LAZ"),

@@ -83,6 +83,10 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--threads", metavar="N", help="number of workers, default: all cores; results do not depend on it"
     )
+    group.add_argument(
+        "--cluster", metavar="ADDRESS",
+        help="have workers find features and matches: local:4, or tcp://HOST:PORT of a scheduler of dask",
+    )  # fmt: skip
     cameras = group.add_mutually_exclusive_group()
     cameras.add_argument(
         "--camera", metavar="MODEL,...|FILE",
@@ -125,6 +129,7 @@ def _options(args: argparse.Namespace) -> Options:
     flags = {
         "seed": args.seed,
         "threads": args.threads,
+        "cluster": args.cluster,
         "images.camera": args.camera,
         "images.camera_model": args.camera_model,
         "images.mask_path": args.mask_path,

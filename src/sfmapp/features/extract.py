@@ -5,19 +5,22 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.executor import Executor, Threads
 from sfmapp.features.octaves import Scratch, bytes_of_scale_space
 from sfmapp.features.orb import extract_orb
 from sfmapp.features.report import FEW_FEATURES, FeaturesReport, ImageFeatures
 from sfmapp.features.sift import compile_kernels, extract_sift
+from sfmapp.formats.feature_files import feature_file, read_feature_file, write_feature_file
 from sfmapp.option_checks import RESOURCE, Range, check_options, positive
 from sfmapp.scene.features import DescriptorMetric, Features
 
@@ -76,6 +79,7 @@ def extract_features(
     events: Events,
     known: Mapping[int, Features] | None = None,
     on_features: Callable[[int, Features], None] | None = None,
+    executor: Executor | None = None,
 ) -> tuple[list[Features], FeaturesReport]:
     """Find and describe the keypoints of all images.
 
@@ -87,6 +91,7 @@ def extract_features(
         known: features by position of the image that need not be extracted again.
         on_features: called with position and features of each newly extracted image, in the calling thread, in the
             order in which images are done: the place to store them.
+        executor: who works on images; None: ``threads`` of this process.
 
     Returns:
         Features in the order of the images, empty for an image that cannot be read, and the report.
@@ -98,34 +103,56 @@ def extract_features(
     lines: dict[int, ImageFeatures] = {}
     start, start_cpu = time.perf_counter(), time.process_time()
     events.started(STAGE, f"{options.kind} on {len(todo)} images", total=len(todo), num_known=len(images) - len(todo))
-    budget, local = _MemoryBudget(_budget_bytes(options)), threading.local()
-
-    def work(i: int) -> tuple[Features, ImageFeatures]:
-        with budget.hold(_bytes_needed(images[i], options)):
-            if not hasattr(local, "scratch"):
-                local.scratch = Scratch()
-            return extract_image(images[i], options, local.scratch)
-
-    with _single_threaded_opencv(), ThreadPoolExecutor(max(1, threads)) as pool:
-        jobs: dict[Future[tuple[Features, ImageFeatures]], int] = {pool.submit(work, i): i for i in todo}
-        try:
-            for job in as_completed(jobs):
-                i = jobs[job]
-                features, lines[i] = job.result()
-                result[i] = features
-                if on_features is not None:
-                    on_features(i, features)
-                for warning in lines[i].warnings:
-                    events.warned(STAGE, warning, image=images[i].name)
-                events.advanced(STAGE, message=images[i].name, image_idx=i, num_features=len(features))
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    executor = executor or Threads(threads, _budget_bytes(options))
+    needs = [_bytes_needed(images[i], options) for i in todo]
+    with (
+        _single_threaded_opencv(),
+        closing(executor.run(_work(executor, options), [images[i] for i in todo], bytes_needed=needs)) as results,
+    ):
+        for n, (features, line) in results:
+            i = todo[n]
+            if features is None:
+                assert executor.folder is not None
+                features = read_feature_file(feature_file(executor.folder, images[i].name))
+            result[i], lines[i] = features, line
+            if on_features is not None:
+                on_features(i, features)
+            for warning in line.warnings:
+                events.warned(STAGE, warning, image=images[i].name)
+            events.advanced(STAGE, message=images[i].name, image_idx=i, num_features=len(features))
     done = [features for features in result if features is not None]
-    took = time.perf_counter() - start, time.process_time() - start_cpu
+    cpu_s = time.process_time() - start_cpu
+    if executor.folder is not None:  # others have worked
+        cpu_s += sum(line.cpu_s or 0.0 for line in lines.values())
+    took = time.perf_counter() - start, cpu_s
     report = _report(images, done, lines, options, took)
     events.finished(STAGE, f"{report.num_features} keypoints in {len(images)} images", **report)
     return done, report
+
+
+def _work(
+    executor: Executor, options: FeatureOptions
+) -> Callable[[ImageRecord], tuple[Features | None, ImageFeatures]]:
+    """What an executor does with one image."""
+    if executor.folder is not None:
+        return partial(_extract_into, executor.folder, options)
+    local = threading.local()
+
+    def extract(record: ImageRecord) -> tuple[Features, ImageFeatures]:
+        if not hasattr(local, "scratch"):
+            local.scratch = Scratch()
+        return extract_image(record, options, local.scratch)
+
+    return extract
+
+
+def _extract_into(folder: Path, options: FeatureOptions, record: ImageRecord) -> tuple[None, ImageFeatures]:
+    """Features of one image into a file; the line of the report about it."""
+    if not record.path.exists():
+        raise InputError(f"{record.path}: the photograph is not there", "workers need all folders at the same paths")
+    features, line = extract_image(record, options)
+    write_feature_file(feature_file(folder, record.name), features)
+    return None, line
 
 
 def extract_image(
@@ -247,27 +274,6 @@ def _budget_bytes(options: FeatureOptions) -> int:
     except (OSError, StopIteration):
         free_kb = 4 << 20
     return free_kb << 9
-
-
-class _MemoryBudget:
-    """Lets workers go ahead while their needs together fit; a single one may exceed it, alone."""
-
-    def __init__(self, num_bytes: int) -> None:
-        self._free = self._total = num_bytes
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def hold(self, num_bytes: int) -> Iterator[None]:
-        need = min(num_bytes, self._total)
-        with self._changed:
-            self._changed.wait_for(lambda: self._free >= need)
-            self._free -= need
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._free += need
-                self._changed.notify_all()
 
 
 @contextmanager

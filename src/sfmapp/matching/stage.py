@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +17,8 @@ from numpy.typing import NDArray
 from sfmapp.camera.camera import Camera, pixels_to_rays
 from sfmapp.errors import InputError
 from sfmapp.events import Events
+from sfmapp.executor import Executor, Threads
+from sfmapp.formats.feature_files import feature_file, read_feature_file, write_feature_file
 from sfmapp.geometry import epipolar, five_point, fundamental_refinement, homography, relative_pose, turned_views
 from sfmapp.matching import guided
 from sfmapp.matching.coarse_to_fine import Putative, is_guidable, match_features
@@ -40,6 +45,9 @@ __all__ = [
 ]
 
 _STAGE = "matching"
+# Pairs go to workers that share no memory in blocks of at most so many images by as many: 16 files of a megabyte are
+# read for 64 pairs, which take some seconds, and progress comes as often.
+_BLOCK = 8
 # In one or two pairs it may be anything that went by.
 _MANY_MOVING = 3
 
@@ -78,6 +86,7 @@ def match_images(
     events: Events,
     known: Mapping[tuple[int, int], MatchedPair] | None = None,
     on_pair: Callable[[int, int, MatchedPair], None] | None = None,
+    executor: Executor | None = None,
 ) -> tuple[Correspondences, MatchingReport]:
     """Match and verify pairs of images. The result is the same, byte for byte, for any number of threads.
 
@@ -87,6 +96,7 @@ def match_images(
         pair_image_idx: (P, 2) int32 positions i < j of images, sorted.
         known: pairs that an earlier run has finished; they are taken over as they are.
         on_pair: called in the calling thread with i, j and the result as each new pair is done, in any order.
+        executor: who matches; None: ``threads`` of this process.
 
     Returns:
         The correspondences, and a report: totals, counts by configuration, and one entry for each pair.
@@ -103,29 +113,16 @@ def match_images(
     if num_known:
         events.advanced(_STAGE, num_known)
     _tell_of_blind_corners(cameras, features, events)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        to_do = [pair for pair in pairs if pair not in done]
-        guidable = sorted({i for pair in to_do for i in pair if is_guidable(features[i], options)})
-        try:
-            backgrounds = dict(
-                zip(guidable, pool.map(lambda i: guided.background_of(features[i]), guidable), strict=True)
-            )
-            futures: dict[Future[MatchedPair], tuple[int, int]] = {
-                pool.submit(
-                    match_pair, (features[i], features[j]), (backgrounds.get(i), backgrounds.get(j)),
-                    (cameras[i], cameras[j]), options, (seed, i, j),
-                ): (i, j)
-                for i, j in to_do
-            }  # fmt: skip
-            for future in as_completed(futures):
-                i, j = futures[future]
-                done[i, j] = future.result()
+    executor = executor or Threads(threads)
+    blocks = _blocks([pair for pair in pairs if pair not in done], image_set, executor)
+    work = _work(executor, image_set, features, blocks, options, seed)
+    with closing(executor.run(work, blocks)) as answers:
+        for n, found in answers:
+            for (i, j), matched in zip(blocks[n].pairs, found, strict=True):
+                done[i, j] = matched
                 if on_pair is not None:
-                    on_pair(i, j, done[i, j])
+                    on_pair(i, j, matched)
                 events.advanced(_STAGE)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
     results = [done[p] for p in pairs]
     report = _report(pairs, results, num_known, time.monotonic() - start)
     if (num_moving := report.num_pairs_with_moving_plane) >= _MANY_MOVING:
@@ -137,6 +134,74 @@ def match_images(
         )
     events.finished(_STAGE, f"{report.num_verified_pairs} of {len(pairs)} pairs verified", **report)
     return join_pairs(pair_image_idx, results), report
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Pairs (i, j) that are matched at one go, and of their images, by position, names and cameras."""
+
+    pairs: tuple[tuple[int, int], ...]
+    names: Mapping[int, str]
+    cameras: Mapping[int, Camera]
+
+
+def _blocks(pairs: list[tuple[int, int]], image_set: ImageSet, executor: Executor) -> list[_Block]:
+    """All pairs in blocks: of one each where memory is shared, else of few images, as these are read for each block."""
+    images = image_set.images
+    if executor.folder is None:
+        parts = [[pair] for pair in pairs]
+    else:
+        squares: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        for i, j in pairs:
+            squares.setdefault((i // _BLOCK, j // _BLOCK), []).append((i, j))
+        parts = list(squares.values())
+    blocks = []
+    for part in parts:
+        both = sorted({i for pair in part for i in pair})
+        names = {i: images[i].name for i in both} if executor.folder is not None else {}
+        blocks.append(_Block(tuple(part), names, {i: image_set.cameras[images[i].camera_idx] for i in both}))
+    return blocks
+
+
+def _work(
+    executor: Executor, image_set: ImageSet, features: Sequence[Features], blocks: Sequence[_Block],
+    options: MatchingOptions, seed: int,
+) -> Callable[[_Block], list[MatchedPair]]:  # fmt: skip
+    """What an executor does with a block; features are in files, or their backgrounds known, when it returns."""
+    wanted = sorted({i for block in blocks for pair in block.pairs for i in pair})
+    if (folder := executor.folder) is not None:
+        for i in wanted:
+            path = feature_file(folder, image_set.images[i].name)
+            if not path.exists():  # those of an earlier run
+                write_feature_file(path, features[i])
+        return partial(_match_stored, folder, options, seed)
+    guidable = [i for i in wanted if is_guidable(features[i], options)]
+    with closing(executor.run(lambda i: guided.background_of(features[i]), guidable)) as found:
+        backgrounds = {guidable[n]: background for n, background in found}
+    return partial(_match_block, lambda i: (features[i], backgrounds.get(i)), options, seed)
+
+
+def _match_block(
+    side: Callable[[int], tuple[Features, Ints | None]], options: MatchingOptions, seed: int, block: _Block
+) -> list[MatchedPair]:
+    """The pairs of a block; ``side`` gives features and background of an image, see :func:`match_features`."""
+    out = []
+    for i, j in block.pairs:
+        (features1, background1), (features2, background2) = side(i), side(j)
+        cameras = block.cameras[i], block.cameras[j]
+        out.append(match_pair((features1, features2), (background1, background2), cameras, options, (seed, i, j)))
+    return out
+
+
+def _match_stored(folder: Path, options: MatchingOptions, seed: int, block: _Block) -> list[MatchedPair]:
+    """The pairs of a block whose features are files in a folder."""
+    return _match_block(lambda i: _read_side(folder, block.names[i], options), options, seed, block)
+
+
+@lru_cache(maxsize=4 * _BLOCK)
+def _read_side(folder: Path, name: str, options: MatchingOptions) -> tuple[Features, Ints | None]:
+    features = read_feature_file(feature_file(folder, name))
+    return features, guided.background_of(features) if is_guidable(features, options) else None
 
 
 def _tell_of_blind_corners(cameras: Sequence[Camera], features: Sequence[Features], events: Events) -> None:

@@ -20,6 +20,7 @@ from typing import Any
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.carve.silhouettes import MaskOptions
 from sfmapp.carve.space_carving import CarveOptions
+from sfmapp.cluster.address import num_local
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError
 from sfmapp.features.extract import FeatureOptions
@@ -54,6 +55,9 @@ class Options:
         masks, carve: those of silhouettes, and of the volume that they leave.
         seed: where every random choice starts; the same seed gives the same bytes.
         threads: worker threads; None: as many as the process has cores. Results do not depend on it.
+        cluster: workers for features and matches of photographs: ``local:N`` for N processes of this machine,
+            ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for those of a scheduler of dask. None: threads of this process.
+            Results do not depend on it.
         min_registered: fail (exit code 5) when fewer images are registered; None: any model will do.
     """
 
@@ -77,10 +81,13 @@ class Options:
     carve: CarveOptions = field(default_factory=CarveOptions)
     seed: int = 0
     threads: int | None = None
+    cluster: str | None = None
     min_registered: int | None = None
 
     def __post_init__(self) -> None:
         check_options("", self, {"seed": Range(0), "threads": Range(1), "min_registered": Range(2)})
+        if self.cluster is not None:
+            num_local(self.cluster)
 
     @property
     def num_workers(self) -> int:

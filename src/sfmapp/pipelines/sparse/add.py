@@ -55,7 +55,7 @@ _BESIDE, _READY = ".adding", "ready"
 # In the order in which they take the place of the old ones: the manifest last.
 _RESULTS = (DATABASE, "sparse", "recording.rrd", GEOREFERENCE, "log.jsonl", PAGE, REPORT, MANIFEST)
 # Options that decide no result, and may be others than at first.
-_FREE = frozenset({"threads", "min_registered", "features.memory_mb"})
+_FREE = frozenset({"threads", "cluster", "min_registered", "features.memory_mb"})
 _MATCHING = "matching"
 
 
@@ -110,7 +110,9 @@ def add_photographs(
         check_finished(folder, manifest)
         if options is not None:
             _check_options(with_absolute_paths(options), first)
-            first = replace(first, threads=options.threads, min_registered=options.min_registered)
+            first = replace(
+                first, threads=options.threads, cluster=options.cluster, min_registered=options.min_registered
+            )
         old_names = names_in_database(folder)
         new = _new_photographs(images, folder, manifest, old_names, first, events)
         for name, reason in new.known:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sfmapp.errors import UsageError
+from sfmapp.executor import Executor
 from sfmapp.features.extract import extract_features
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.matching.stage import match_images
@@ -33,11 +37,12 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
     with (
         kernels_compiling(events, run.usage, modules),
         Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
+        _executor(run, image_set) as executor,
     ):
         with run.stage("features", keys.features):
             run.features, extracted = extract_features(
                 image_set, options.features, threads=threads, events=events,
-                known=store.known_features(), on_features=store.put_features,
+                known=store.known_features(), on_features=store.put_features, executor=executor,
             )  # fmt: skip
             run.stages = replace(run.stages, features=extracted)
         with run.stage("pairs", keys.pairs):
@@ -51,8 +56,28 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
         with run.stage("matching", keys.matching):
             run.correspondences, matched = match_images(
                 image_set, run.features, pairs, options.matching, seed=options.seed, threads=threads, events=events,
-                known=store.known_pairs(pairs), on_pair=store.put_pair,
+                known=store.known_pairs(pairs), on_pair=store.put_pair, executor=executor,
             )  # fmt: skip
             store.flush()
             run.stages = replace(run.stages, matching=matched)
     return run.correspondences
+
+
+@contextmanager
+def _executor(run: Run, image_set: ImageSet) -> Iterator[Executor | None]:
+    """The workers of a cluster that find features and matches; None: threads of this process do."""
+    address = run.options.cluster
+    if address is None:
+        yield None
+        return
+    if any(record.source is not None for record in image_set.images):
+        raise UsageError(
+            "photographs in memory cannot be given to a cluster", "write them to a folder that its workers see"
+        )
+    from sfmapp.cluster.dask_executor import open_cluster
+
+    paths = {record.path.parent for record in image_set.images} | {
+        record.mask_path.parent for record in image_set.images if record.mask_path is not None
+    }
+    with open_cluster(address, run.workspace.folder, sorted(paths), run.events) as executor:
+        yield executor
