@@ -78,7 +78,7 @@ INNER_FLOORS = {
     "pipelines": (
         ("*",),
         ("export_world",),
-        ("calibration", "dense", "odometry"),
+        ("calibration", "dense", "odometry", "planning"),
         ("sparse",),
         ("calibrated_model",),
         ("lens_fit", "metres", "stored_pixels"),

@@ -13,7 +13,7 @@ from sfmapp.errors import InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.features.extract import (
     FeatureOptions,
-    _bytes_needed,
+    bytes_of_extraction,
     extract_features,
     features_from_picture,
 )
@@ -159,10 +159,10 @@ def test_memory_estimate_covers_what_is_taken() -> None:
     features_from_picture(picture, FeatureOptions())
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    estimate = _bytes_needed(ImageRecord("a", Path("a"), 1600, 1250), FeatureOptions())
+    estimate = bytes_of_extraction(ImageRecord("a", Path("a"), 1600, 1250), FeatureOptions())
     assert 0.6 * estimate < peak < estimate
     # fifty megapixels are scaled down first
-    large = _bytes_needed(ImageRecord("a", Path("a"), 8660, 5773), FeatureOptions())
+    large = bytes_of_extraction(ImageRecord("a", Path("a"), 8660, 5773), FeatureOptions())
     assert large < 1.2e9
 
 

@@ -113,6 +113,12 @@ class Events:
         other._cancelled = threading.Event()
         return other
 
+    def unheard(self) -> Events:
+        """The same wish to stop, and nobody who listens: for a stage that is a step of another."""
+        other = copy.copy(self)
+        other._listeners, other._progress = [], {}
+        return other
+
     def raise_if_cancelled(self) -> None:
         """Raise InterruptedRunError if :meth:`cancel` was called."""
         if self._cancelled.is_set():

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sfmapp.pipelines.sparse.locate import LocatedResult
     from sfmapp.pipelines.undistort import UndistortResult
     from sfmapp.report.model import ExportReport, OdometryRunReport, ReconstructionReport, RefineReport
+    from sfmapp.report.plan import PlanReport
     from sfmapp.report.validation import Validation
 
 FilePath = str | os.PathLike[str]
@@ -131,6 +132,45 @@ def reconstruct(
         adjust_options=options.adjust, events=events, threads=workers,
     )  # fmt: skip
     return RunResult(models[0], None)
+
+
+def plan(
+    images: Images,
+    options: Options | None = None,
+    *,
+    events: Events | None = None,
+    threads: int | None = None,
+    seed: int | None = None,
+) -> PlanReport:
+    """Tell what :func:`reconstruct` will take, and what will probably go wrong, before it begins.
+
+    Photographs are looked at in small, a few are worked on as the run will do it, and the machine is measured once, by
+    the bundled sample. The plan is remembered for this user: a run with the same photographs and options compares
+    itself with it, in ``report.plan``.
+
+    Args:
+        images: as ``reconstruct`` takes them.
+        options: of all stages; see ``load_options``.
+        events: told of everything that happens, and can ask it to stop.
+        threads: workers of the run; None: as ``options.threads`` says, or as many as there are cores.
+        seed: in place of ``options.seed``.
+
+    Returns:
+        Cameras, groups, pairs, CPU and wall seconds and memory (1e6 bytes) of each stage as intervals that hold nine in
+        ten, disk, and ``doubts``, each with photographs, what was found, and a remedy.
+
+    Raises:
+        InputError: the photographs do not exist or cannot be read.
+        NoReconstructionError: fewer than two can be used.
+        InterruptedRunError: a stop was asked for.
+
+    Example:
+        >>> planned = sfmapp.plan("photos/")
+        >>> planned.whole.wall_s.likely, [doubt.message for doubt in planned.doubts]
+    """
+    from sfmapp.pipelines.planning import plan as pipeline
+
+    return pipeline.plan(images, options_with(options, threads, seed), events=events)
 
 
 def track_sequence(

@@ -55,7 +55,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--list-options", action="store_true", help="list every stage.option with its default and effect"
     )
-    _add_option_flags(parser)
+    add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_reconstruct, parser=parser)
 
@@ -65,12 +65,13 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "ground truth.",
     )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, default=Path("demo"), help="default: demo")
-    _add_option_flags(parser)
+    add_option_flags(parser)
     add_output_flags(parser, has_log=True)
     parser.set_defaults(run=_demo, parser=parser)
 
 
-def _add_option_flags(parser: argparse.ArgumentParser) -> None:
+def add_option_flags(parser: argparse.ArgumentParser) -> None:
+    """Flags that set options of a reconstruction; :func:`effective_options` reads them."""
     group = parser.add_argument_group("options (the last one wins: presets in order, then --set, then flags)")
     group.add_argument(
         "--preset", metavar="NAME|FILE", action="append", default=[],
@@ -121,7 +122,7 @@ def _add_option_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
 
-def _options(args: argparse.Namespace) -> Options:
+def effective_options(args: argparse.Namespace) -> Options:
     """The effective options of a command line."""
     limit_library_threads()
     from sfmapp.workspace.options import load_options
@@ -154,7 +155,7 @@ def _reconstruct(args: argparse.Namespace) -> int:
         args.parser.error("--texture needs --mesh")
     if args.texture:
         args.set.append("surface.texture=true")
-    options = _options(args)
+    options = effective_options(args)
     report = _run(args, args.images, options)
     result = reconstruction_result(args.output, report)
     if not args.json and not args.quiet:
@@ -189,7 +190,7 @@ def _go_on(args: argparse.Namespace, options: Options) -> dict[str, object]:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    options = _options(args)
+    options = effective_options(args)
     from sfmapp.pipelines.demo import compare_with_ground_truth
     from sfmapp.workspace.resources import sample_folder
 
@@ -353,4 +354,6 @@ def print_summary(output: Path, report: ReconstructionReport) -> None:
     if report.stages.poses is not None:
         print_contradictions(report.stages.poses.contradictions)
     print(took(output, run))
+    if report.plan is not None and not run.is_up_to_date:
+        print(f"  {report.plan.sentence}")
     print(f"model {output / 'sparse' / '0'}, report {output / 'report.html'}; look at it: sfmapp view {output}")

@@ -103,8 +103,8 @@ def extract_features(
     lines: dict[int, ImageFeatures] = {}
     start, start_cpu = time.perf_counter(), time.process_time()
     events.started(STAGE, f"{options.kind} on {len(todo)} images", total=len(todo), num_known=len(images) - len(todo))
-    executor = executor or Threads(threads, _budget_bytes(options))
-    needs = [_bytes_needed(images[i], options) for i in todo]
+    executor = executor or Threads(threads, bytes_for_extraction(options))
+    needs = [bytes_of_extraction(images[i], options) for i in todo]
     with (
         _single_threaded_opencv(),
         closing(executor.run(_work(executor, options), [images[i] for i in todo], bytes_needed=needs)) as results,
@@ -255,7 +255,7 @@ def _report(
     )
 
 
-def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:
+def bytes_of_extraction(record: ImageRecord, options: FeatureOptions) -> int:
     """Estimate of the memory that one image takes at the peak of its extraction."""
     pixels = record.width * record.height
     scale = min(1.0, options.max_size_px / max(record.width, record.height))
@@ -265,7 +265,8 @@ def _bytes_needed(record: ImageRecord, options: FeatureOptions) -> int:
     return 5 * pixels + work
 
 
-def _budget_bytes(options: FeatureOptions) -> int:
+def bytes_for_extraction(options: FeatureOptions) -> int:
+    """Memory that all workers together may take."""
     if options.memory_mb is not None:
         return options.memory_mb << 20
     try:

@@ -12,6 +12,7 @@ from sfmapp.report.control_html import control_section, poses_section, units_sec
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.plan import PlanCheck
 from sfmapp.report.top_view import top_view_svg
 from sfmapp.report.world_map import world_section
 from sfmapp.reporting import NamedReason
@@ -95,8 +96,25 @@ def render_html(
         entries = enumerate(report.stages.mapping.models)
         body.append(adjustment_table((f"model {m}", model.adjustment) for m, model in entries))
     body.append(usage_table(report.usage, report.run))
+    if report.plan is not None:
+        body.append(_planned(report.plan))
     body.append(log_table("Warnings", report.warnings) + log_table("Decisions", report.decisions))
     return render_page(f"sfmapp: {report.run.source}", body)
+
+
+def _planned(plan: PlanCheck) -> str:
+    """What ``sfmapp plan`` had said of the run."""
+    rows = [
+        [
+            ("t", row.stage), ("t", f"{row.quantity}, {row.unit}"), ("", row.planned.text("")),
+            ("" if row.is_within else "amber", f"{row.took:.2f}" if row.took < 100 else f"{row.took:.0f}"),
+        ]
+        for row in plan.rows
+    ]  # fmt: skip
+    head = [("t", "stage"), ("t", ""), ("", "planned"), ("", "taken")]
+    return f"<h2>Planned and taken</h2><p>{escape(plan.sentence[:1].upper() + plan.sentence[1:])}</p>" + table(
+        head, rows
+    )
 
 
 def _orientation(report: ReconstructionReport, model: Reconstruction) -> list[int]:

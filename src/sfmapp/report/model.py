@@ -33,6 +33,7 @@ from sfmapp.images.report import ImagesReport
 from sfmapp.mapping.report import FocalEvidence, MappingReport, ModelEntry
 from sfmapp.matching.report import MatchingReport, PairsReport
 from sfmapp.odometry.report import FilterReport, OdometryReport, ScaleReport
+from sfmapp.report.plan import PlanCheck
 from sfmapp.reporting import NamedReason, Plain, Report, Step, Usage
 from sfmapp.surface.report import MeshReport
 
@@ -361,6 +362,7 @@ class ReconstructionReport(Report):
         usage: of each stage.
         added: the photographs that were added last; absent where there were none.
         dense: patches and mesh; absent without.
+        plan: what was planned beside what the run took; absent where nothing was planned, or not all was done anew.
     """
 
     format: str
@@ -378,6 +380,7 @@ class ReconstructionReport(Report):
     added: AddedReport | None = None
     merged: MergedReport | None = None
     dense: DensePart | None = None
+    plan: PlanCheck | None = None
 
 
 class DenseRunReport(Report):

@@ -33,6 +33,7 @@ from sfmapp.report.model import (
 )
 from sfmapp.report.pair_html import PairReport
 from sfmapp.report.panorama_html import PanoramaReport
+from sfmapp.report.plan import PlanReport
 from sfmapp.report.stereo_document import StereoReport
 from sfmapp.report.sweep_document import SweepReport
 from sfmapp.report.transfer_html import TransferRunReport
@@ -43,10 +44,11 @@ from sfmapp.stereo.design import DesignReport
 
 # by the name of the file: report.json of reconstruct, of dense and mesh on a foreign model, of odometry, refine,
 # calibrate, locate (of points, in a model), pair, panorama, warp, rectify, stereo, carve, masks and sweep;
-# calibration.json; validation/report.json and validation/cloud.json; what evaluate, undistort, export, measure and
-# stereo-design print with --json; and georeference.json
+# calibration.json; validation/report.json and validation/cloud.json; what plan, evaluate, undistort, export, measure
+# and stereo-design print with --json; and georeference.json
 KINDS: Mapping[str, type[Report]] = {
     "reconstruct": ReconstructionReport,
+    "plan": PlanReport,
     "dense": DenseRunReport,
     "odometry": OdometryRunReport,
     "refine": RefineReport,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sfmapp.geometry.orientation import MIRRORED, upright_pixels
 from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.pixels import decode_bytes, to_8_bits
+from sfmapp.images.small import decode_reduced_jpeg, small_picture
 
 # Photographs get smaller when there are many: about 40 MB for any number up to 1000, of about 100 KB at 1000 px.
 _SIDE_PX = (360, 1000)
@@ -52,7 +53,7 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
         return None
     is_jpeg = header.format == "jpeg"
     if is_jpeg:
-        pixels = _decode_jpeg(data, max(header.width, header.height) / max_side_px)
+        pixels = decode_reduced_jpeg(data, max(header.width, header.height) / max_side_px)
     else:
         raw = decode_bytes(data, header)
         pixels = None if raw is None else _as_bgr(to_8_bits(raw))
@@ -62,9 +63,9 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
     is_fit = is_jpeg and orientation == 1 and max(pixels.shape[:2]) <= max_side_px and len(data) <= _KEEP_BYTES
     # a reduced decode may have made it fit: the file itself has not changed
     is_fit = is_fit and (header.height, header.width) == pixels.shape[:2]
-    pixels = _shrink(pixels, max_side_px)
+    pixels = small_picture(pixels, max_side_px)
     photo = data if is_fit else _jpeg(pixels, SCREEN_QUALITY)
-    thumbnail = _shrink(pixels, thumbnail_px)
+    thumbnail = small_picture(pixels, thumbnail_px)
     if orientation in MIRRORED:
         thumbnail = np.ascontiguousarray(thumbnail[:, ::-1])
     return ScreenPhoto(photo, pixels.shape[1::-1], _jpeg(thumbnail, _THUMBNAIL_QUALITY), thumbnail.shape[1::-1])
@@ -72,25 +73,8 @@ def load_screen_photo(path: Path, orientation: int, max_side_px: int, thumbnail_
 
 def shrunk_jpeg(pixels: Any, max_side_px: int, quality: int) -> tuple[bytes, tuple[int, int]]:
     """uint8 pixels (H, W) or (H, W, 3) BGR as JPEG bytes, shrunk to fit, and the size (width, height) of that."""
-    small = _shrink(pixels, max_side_px)
+    small = small_picture(pixels, max_side_px)
     return _jpeg(small, quality), small.shape[1::-1]
-
-
-def _decode_jpeg(data: bytes, shrink: float) -> Any:
-    """(H, W, 3) BGR uint8 as stored, reduced by the largest power of two below shrink; None if it is damaged."""
-    import cv2
-
-    flag = cv2.IMREAD_COLOR
-    for factor, reduced in (
-        (2, cv2.IMREAD_REDUCED_COLOR_2),
-        (4, cv2.IMREAD_REDUCED_COLOR_4),
-        (8, cv2.IMREAD_REDUCED_COLOR_8),
-    ):
-        flag = reduced if shrink >= factor else flag
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
 
 
 def _as_bgr(pixels: Any) -> Any:
@@ -103,18 +87,8 @@ def _as_bgr(pixels: Any) -> Any:
 
 def shrunk(pixels: NDArray[np.uint8], max_side_px: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """A picture (H, W, 3) for a screen, and the factors (2,) of its pixels."""
-    small: NDArray[np.uint8] = _shrink(pixels, max_side_px)
+    small = small_picture(pixels, max_side_px)
     return small, np.divide(small.shape[1::-1], pixels.shape[1::-1])
-
-
-def _shrink(pixels: Any, max_side_px: int) -> Any:
-    import cv2
-
-    scale = max_side_px / max(pixels.shape[:2])
-    if scale >= 1:
-        return pixels
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def _jpeg(pixels: Any, quality: int) -> bytes:

@@ -14,6 +14,7 @@ from sfmapp.formats.colmap import MODEL_FILES
 from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.georeference.world_frame import GEOREFERENCE, write_georeference
 from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
+from sfmapp.pipelines.sparse.planned import held_against_plan
 from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
 from sfmapp.report.document import (
     FORMAT,
@@ -81,7 +82,8 @@ def write_results(
     report = _make_report(run, models, failure)
     if run.added is not None:
         report = replace(report, added=run.added(models))
-    report = replace(report, merged=run.merged)
+    plan = held_against_plan(keys, run.options, run.stages, run.usage, report.run)
+    report = replace(report, merged=run.merged, plan=plan)
     page = render_html(report, models[0] if models else None)
     run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()  # the last measurement that can still be written down

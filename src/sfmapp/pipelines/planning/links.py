@@ -1,0 +1,124 @@
+"""Which photographs probably show the same, by features of small versions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.events import Events
+from sfmapp.images.image_set import ImageSet
+from sfmapp.matching.options import MatchingOptions
+from sfmapp.matching.stage import match_pair
+from sfmapp.scene.correspondences import TwoViewConfig
+from sfmapp.scene.features import Features
+
+STAGE = "overlap"
+# pairs a task: one takes a third of a millisecond where nothing matches
+_BATCH = 64
+# A small feature is off by a pixel or so of the small version, three of the whole: COLMAP's 4 px at two megapixels,
+# which the matching stage scales with the picture, become this share of the diagonal.
+_ERROR_SHARE = 0.004
+# hypotheses, of a few dozen matches
+_MAX_TRIALS = 500
+# Verified matches of small versions that make a pair; the stage asks for 15 of ten times as many features.
+_MIN_INLIERS = 10
+
+
+@dataclass(frozen=True)
+class Links:
+    """Pairs that the run will compare, and which of them overlap as far as a cheap look tells.
+
+    Attributes:
+        pairs: (P, 2) int32 positions i < j.
+        num_matches: (P,) int64 verified matches of small versions, 0 where there is no link.
+        num_putative: (P,) int64 matches of small versions before verification.
+        config: (P,) int8 of :class:`~sfmapp.scene.correspondences.TwoViewConfig`.
+    """
+
+    pairs: NDArray[np.int32]
+    num_matches: NDArray[np.int64]
+    num_putative: NDArray[np.int64]
+    config: NDArray[np.int8]
+
+    @property
+    def is_linked(self) -> NDArray[np.bool_]:
+        """(P,) bool."""
+        return self.num_matches > 0
+
+    def with_found(self, found: Iterable[tuple[int, int]]) -> Links:
+        """The same with pairs that whole photographs have linked where small versions showed nothing."""
+        position = {(int(i), int(j)): p for p, (i, j) in enumerate(self.pairs)}
+        num_matches = self.num_matches.copy()
+        for pair in found:
+            if pair in position:
+                num_matches[position[pair]] = max(1, num_matches[position[pair]])
+        return replace(self, num_matches=num_matches)
+
+    def groups(self, num_images: int) -> list[list[int]]:
+        """Photographs that are linked with each other, the largest group first, then by the first of each."""
+        parent = list(range(num_images))
+
+        def root(i: int) -> int:
+            while parent[i] != i:
+                parent[i] = parent[parent[i]]
+                i = parent[i]
+            return i
+
+        for i, j in self.pairs[self.is_linked]:
+            parent[root(int(j))] = root(int(i))
+        members: dict[int, list[int]] = {}
+        for i in range(num_images):
+            members.setdefault(root(i), []).append(i)
+        return sorted(members.values(), key=lambda group: (-len(group), group[0]))
+
+    def degrees(self, num_images: int) -> NDArray[np.int64]:
+        """(I,) number of links of each photograph."""
+        return np.bincount(self.pairs[self.is_linked].ravel(), minlength=num_images)
+
+
+def find_links(
+    image_set: ImageSet, features: Sequence[Features], pairs: NDArray[np.int32], *, seed: int, threads: int,
+    events: Events,
+) -> Links:  # fmt: skip
+    """Match the small versions of all pairs; the result does not depend on the number of threads.
+
+    Args:
+        features: of small versions, in pixels of the whole photographs.
+        pairs: (P, 2) int32.
+    """
+    cameras = [image_set.cameras[image.camera_idx] for image in image_set.images]
+    num_matches, num_putative = np.zeros(len(pairs), np.int64), np.zeros(len(pairs), np.int64)
+    config = np.zeros(len(pairs), np.int8)
+    events.started(STAGE, f"comparing {len(pairs)} pairs in small", total=len(pairs))
+
+    def compare(first: int) -> int:
+        last = min(first + _BATCH, len(pairs))
+        for p in range(first, last):
+            i, j = map(int, pairs[p])
+            diagonal = max(float(np.hypot(cameras[k].width, cameras[k].height)) for k in (i, j))
+            options = MatchingOptions(
+                max_error_px=min(_ERROR_SHARE * diagonal, 1000.0), min_inliers=_MIN_INLIERS,
+                max_ransac_trials=_MAX_TRIALS,
+            )  # fmt: skip
+            found = match_pair(
+                (features[i], features[j]), (None, None), (cameras[i], cameras[j]), options, (seed, i, j)
+            )
+            num_putative[p] = found.num_putative
+            if found.geometry.config not in (TwoViewConfig.UNDEFINED, TwoViewConfig.DEGENERATE):
+                num_matches[p], config[p] = len(found.matches), found.geometry.config
+        return last - first
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        try:
+            for done in pool.map(compare, range(0, len(pairs), _BATCH)):
+                events.advanced(STAGE, done)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    links = Links(np.asarray(pairs, np.int32), num_matches, num_putative, config)
+    events.finished(STAGE, f"{int(links.is_linked.sum())} of {len(pairs)} pairs are linked")
+    return links
