@@ -68,14 +68,19 @@ def test_same_bytes_on_any_number_of_threads(five: ImageSet, kind: str) -> None:
 
 def test_known_features_are_kept_and_new_ones_told_in_this_thread(five: ImageSet) -> None:
     all_of_them, _ = extract_features(five, SMALL, threads=2, events=Events())
-    told: list[tuple[int, Features, threading.Thread]] = []
+    told: list[tuple[int, threading.Thread]] = []
     heard: list[Event] = []
+
+    def store(i: int, features: Features) -> Features:
+        told.append((i, threading.current_thread()))
+        return features
+
     features, report = extract_features(
         five, SMALL, threads=2, events=Events(heard.append), known={1: all_of_them[1], 3: all_of_them[3]},
-        on_features=lambda i, f: told.append((i, f, threading.current_thread())),
+        store=store,
     )  # fmt: skip
-    assert sorted(i for i, _, _ in told) == [0, 2, 4]
-    assert all(thread is threading.current_thread() for _, _, thread in told)
+    assert sorted(i for i, _ in told) == [0, 2, 4]
+    assert all(thread is threading.current_thread() for _, thread in told)
     assert features[1] is all_of_them[1]
     assert as_bytes(features) == as_bytes(all_of_them)
     assert report["num_known"] == 2
@@ -87,13 +92,14 @@ def test_a_stop_is_obeyed_and_what_is_done_was_told(five: ImageSet) -> None:
     told: list[int] = []
     events = Events()
 
-    def stop(i: int, features: Features) -> None:
+    def stop(i: int, features: Features) -> Features:
         told.append(i)
         events.cancel()
+        return features
 
     threads = cv2.getNumThreads()
     with pytest.raises(InterruptedRunError):
-        extract_features(five, SMALL, threads=1, events=events, on_features=stop)
+        extract_features(five, SMALL, threads=1, events=events, store=stop)
     assert len(told) == 1
     assert cv2.getNumThreads() == threads
 

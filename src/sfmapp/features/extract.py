@@ -78,7 +78,7 @@ def extract_features(
     threads: int,
     events: Events,
     known: Mapping[int, Features] | None = None,
-    on_features: Callable[[int, Features], None] | None = None,
+    store: Callable[[int, Features], Features] | None = None,
     executor: Executor | None = None,
 ) -> tuple[list[Features], FeaturesReport]:
     """Find and describe the keypoints of all images.
@@ -89,8 +89,8 @@ def extract_features(
         threads: images worked on at a time, at most; fewer where memory is short. The result does not depend on it.
         events: receives the progress, image by image, and warnings that name the file.
         known: features by position of the image that need not be extracted again.
-        on_features: called with position and features of each newly extracted image, in the calling thread, in the
-            order in which images are done: the place to store them.
+        store: called with position and features of each newly extracted image, in the calling thread, in the order in
+            which images are done. What it returns stands in their place in the result.
         executor: who works on images; None: ``threads`` of this process.
 
     Returns:
@@ -114,9 +114,7 @@ def extract_features(
             if features is None:
                 assert executor.folder is not None
                 features = read_feature_file(feature_file(executor.folder, images[i].name))
-            result[i], lines[i] = features, line
-            if on_features is not None:
-                on_features(i, features)
+            result[i], lines[i] = features if store is None else store(i, features), line
             for warning in line.warnings:
                 events.warned(STAGE, warning, image=images[i].name)
             events.advanced(STAGE, message=images[i].name, image_idx=i, num_features=len(features))

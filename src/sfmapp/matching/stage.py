@@ -146,15 +146,17 @@ class _Block:
 
 
 def _blocks(pairs: list[tuple[int, int]], image_set: ImageSet, executor: Executor) -> list[_Block]:
-    """All pairs in blocks: of one each where memory is shared, else of few images, as these are read for each block."""
+    """All pairs in blocks: of one each where memory is shared, else of few images, as these are read for each block.
+
+    Pairs of the same images follow one another also in the first case, for those who read them from a database.
+    """
     images = image_set.images
+    squares: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in pairs:
+        squares.setdefault((i // _BLOCK, j // _BLOCK), []).append((i, j))
+    parts = list(squares.values())
     if executor.folder is None:
-        parts = [[pair] for pair in pairs]
-    else:
-        squares: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for i, j in pairs:
-            squares.setdefault((i // _BLOCK, j // _BLOCK), []).append((i, j))
-        parts = list(squares.values())
+        parts = [[pair] for part in parts for pair in part]
     blocks = []
     for part in parts:
         both = sorted({i for pair in part for i in pair})

@@ -42,7 +42,7 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
         with run.stage("features", keys.features):
             run.features, extracted = extract_features(
                 image_set, options.features, threads=threads, events=events,
-                known=store.known_features(), on_features=store.put_features, executor=executor,
+                known=store.known_features(), store=store.put_features, executor=executor,
             )  # fmt: skip
             run.stages = replace(run.stages, features=extracted)
         with run.stage("pairs", keys.pairs):
