@@ -82,6 +82,9 @@ def run_sfmapp(data: DataSet, seed: int, work: Path, args: argparse.Namespace) -
     command += ["--threads", str(args.threads)] if args.threads else []
     command += [flag for setting in args.set for flag in ("--set", setting)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(args.numba_cache)}
+    # byte code is kept as pip does when it installs, and as it is there of pycolmap
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    environment["PYTHONPYCACHEPREFIX"] = str(args.numba_cache / "bytecode")
     usage = run_measured(command, work / "sfmapp.log", env=environment)
     if usage.exit_code not in (0, 4):
         tail = (work / "sfmapp.log").read_text(errors="replace")[-2000:]

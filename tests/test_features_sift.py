@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfmapp.features import scale_space
+from sfmapp.features import descriptor, scale_space
 from sfmapp.features.octaves import Octave, Scratch
 from sfmapp.features.sift import extract_sift
 
@@ -40,8 +42,6 @@ def blobs(xy: np.ndarray, sigma: np.ndarray, size: tuple[int, int], contrast: fl
 
 def texture(size: tuple[int, int], seed: int = 0) -> np.ndarray:
     """Smooth noise over all scales."""
-    import cv2
-
     rng = np.random.default_rng(seed)
     total = np.zeros(size[::-1], np.float32)
     for s in (1.0, 2.0, 4.0, 8.0, 16.0):
@@ -163,8 +163,6 @@ def test_noise_and_stripes_survive() -> None:
 
 
 def half_size(path: Path) -> np.ndarray:
-    import cv2
-
     gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     return cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
@@ -286,12 +284,65 @@ def test_levels_looked_up_around_a_pixel_are_those_of_the_octave() -> None:
                 np.testing.assert_array_equal(found, level[top : top + rows, left : left + cols])
 
 
+def test_blur_is_a_plain_sum_however_rows_are_divided() -> None:
+    """In numpy, at widths around whole vectors, with kernels of either length; a few rows at a time the same bytes."""
+    rng = np.random.default_rng(0)
+    for width, reach in itertools.product((13, 31, 32, 33, 90), (4, 6, 10)):
+        image = rng.uniform(0.0, 255.0, (37, width)).astype(np.float32)
+        taps = np.exp(-0.5 * (np.arange(reach + 1) / (reach / 3.0)) ** 2).astype(np.float32)
+        both = np.concatenate([taps[:0:-1], taps]).astype(np.float64)
+        padded = np.pad(image.astype(np.float64), reach, mode="reflect")
+        down = np.einsum("rck,k->rc", np.lib.stride_tricks.sliding_window_view(padded, len(both), 0), both)
+        expected = np.einsum("rck,k->rc", np.lib.stride_tricks.sliding_window_view(down, len(both), 1), both)
+        whole, parts = np.empty_like(image), np.empty_like(image)
+        lines = scale_space.empty_lines(width)
+        scale_space.blur(image, taps, lines, whole, (0, 37, 37), (0, 0))
+        np.testing.assert_allclose(whole, expected, rtol=3e-6)
+        for first in range(0, 37, 7):
+            top, last = max(0, first - reach), min(37, first + 7)
+            scale_space.blur(image[top : last + reach], taps, lines, parts, (first, last, 37), (top, 0))
+        np.testing.assert_array_equal(parts, whole)
+
+
+def test_descriptors_are_those_of_a_plain_histogram() -> None:
+    """Every second gradient in the turned square of cells, dealt out to eight neighbours, in numpy; at borders too."""
+    rng = np.random.default_rng(1)
+    level = scale_space.empty_level((70, 90))
+    level[:] = cv2.GaussianBlur(rng.uniform(0.0, 255.0, level.shape), (0, 0), 2.0)
+    found = np.column_stack([rng.uniform(5.0, 85.0, 40), rng.uniform(5.0, 65.0, 40), rng.uniform(0.5, 3.5, 40)])
+    angle, out = rng.uniform(0.0, 2.0 * np.pi, 40), np.empty((40, 128), np.uint8)
+    descriptor.describe_all((level, level, level), 0, found, angle, out)
+    for (x, y, layer), turn, mine in zip(found, angle, out, strict=True):
+        cell = 3.0 * scale_space.SIGMA * 2.0 ** (layer / 3.0)
+        reach = int(2.5 * cell * (abs(np.cos(turn)) + abs(np.sin(turn)))) + 1
+        rows = np.arange(max(1, round(y) - reach), min(69, round(y) + reach + 1), 2)
+        columns = np.arange(max(1, round(x) - reach), min(89, round(x) + reach + 1), 2)
+        r, c = (place.ravel() for place in np.meshgrid(rows, columns, indexing="ij"))
+        along = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) @ [c - x, r - y] / cell
+        near = (np.abs(along) < 2.5).all(axis=0)
+        r, c, (u, v) = r[near], c[near], along[:, near]
+        gradient = (level[r, c + 1] - level[r, c - 1]) + 1j * (level[r + 1, c] - level[r - 1, c])
+        weight = np.abs(gradient) * np.exp(-(u**2 + v**2) / 8.0)
+        eighths = (turn - np.angle(gradient)) * 4.0 / np.pi % 8.0
+        cells = np.zeros((6, 6, 8))
+        for i, j, k in np.ndindex(2, 2, 2):
+            at = [np.floor(each).astype(int) + step for each, step in ((v + 2.5, i), (u + 2.5, j), (eighths, k))]
+            share = np.prod([
+                1.0 - np.abs(place - each) for place, each in zip(at, (v + 2.5, u + 2.5, eighths), strict=True)
+            ], axis=0)  # fmt: skip
+            np.add.at(cells, (at[0], at[1], at[2] % 8), weight * share)
+        inside = cells[1:5, 1:5].ravel()
+        inside = np.minimum(inside, 0.2 * np.linalg.norm(inside))
+        expected = np.minimum(512.0 * np.sqrt(inside / inside.sum()), 255.0)
+        assert np.abs(mine - expected).max() < 1.0  # half of it is rounding, the rest the angles to 1e-5
+
+
 def test_extrema_are_those_of_a_plain_search() -> None:
     """All 26 neighbours, in numpy, at widths around whole vectors and whole tiles."""
     rng = np.random.default_rng(0)
     for width in (13, 26, 27, 90, scale_space.TILE + 12):
-        flat = rng.normal(size=6 * 40 * width + 16).astype(np.float32)
-        levels = tuple(flat[:-16].reshape(6, 40, width))
+        flat = rng.normal(size=6 * 40 * width + scale_space.SLACK).astype(np.float32)
+        levels = tuple(flat[: -scale_space.SLACK].reshape(6, 40, width))
         place, value = np.empty((40 * width, 4), np.int32), np.empty(40 * width, np.float32)
         rows = np.zeros((scale_space.NUM_ROWS_AT_WORK, scale_space.PITCH), np.float32)
         marks = np.empty(scale_space.PITCH, np.int64)

@@ -13,6 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features.scale_space import NUM_LAYERS, SIGMA
+from sfmapp.simd.bits import count_bits, first_bit
+from sfmapp.simd.f32x16 import (
+    WIDTH,
+    add,
+    fma,
+    load,
+    load_every_second,
+    multiply,
+    smaller,
+    splat,
+    store,
+    subtract,
+    total,
+    where_above,
+)
+from sfmapp.simd.pointers import Pointer, pointer
 
 # distance of the gradients that orientations and descriptors sample: the levels are so smooth that every second one
 # gives the same matches for a quarter of the time
@@ -26,8 +42,27 @@ _CELL_SIGMAS = 3.0
 _EXP_MAX = 12.5
 _EXP_SIZE = 2048
 _EXP_TABLE = np.exp(-np.arange(_EXP_SIZE + 1) * (_EXP_MAX / _EXP_SIZE)).astype(np.float32)
-# gradients of one descriptor at most: the turned square of 5 x 5 cells at the largest scale of an octave
-MAX_SAMPLES = int((5.0 * _CELL_SIGMAS * SIGMA * 2.0 ** (4.0 / 3.0) / STRIDE + 2.0) ** 2 * 1.2)
+# gradients of one descriptor at most: the turned square of 5 x 5 cells at the largest scale of an octave, and what the
+# last vector has too many
+_MAX_SAMPLES = int((5.0 * _CELL_SIGMAS * SIGMA * 2.0 ** (4.0 / 3.0) / STRIDE + 2.0) ** 2 * 1.2) + WIDTH
+# working memory, in floats: places and gradients of the samples, then of the columns that they lie in, then a histogram
+# of 5 x 5 squares between the centres of cells, of which each has 8 directions at its four corners
+_U, _V, _GX, _GY = 0, _MAX_SAMPLES, 2 * _MAX_SAMPLES, 3 * _MAX_SAMPLES
+_SQUARE, _DIRECTION, _WEIGHT = 4 * _MAX_SAMPLES, 5 * _MAX_SAMPLES, 6 * _MAX_SAMPLES
+_MAX_COLUMNS = 4 * WIDTH
+_COLUMN_U, _COLUMN_V = 7 * _MAX_SAMPLES, 7 * _MAX_SAMPLES + _MAX_COLUMNS
+_HISTOGRAM = 7 * _MAX_SAMPLES + 2 * _MAX_COLUMNS
+_PER_SQUARE = 2 * WIDTH
+_CELLS = _HISTOGRAM + 25 * _PER_SQUARE
+ROOM = _CELLS + 128
+# a place that is in no window
+_AWAY = np.float32(1e9)
+# of each direction, where it stands among those of two cells, and what the next one has more
+_ONE_HOT = np.tile(np.eye(8, dtype=np.float32), 2)
+_TO_NEXT = np.roll(_ONE_HOT, -1, axis=0) - _ONE_HOT
+# of two cells side by side the left one, and what the right one has more
+_LEFT = np.repeat(np.array([1.0, 0.0], np.float32), 8)
+_TO_RIGHT = np.repeat(np.array([-1.0, 1.0], np.float32), 8)
 
 Floats = NDArray[np.float32]
 
@@ -92,135 +127,233 @@ def _find_peaks(hist: NDArray[np.float64], max_num: int, out: NDArray[np.float64
 
 
 @numba.njit(cache=True, nogil=True)
+def _gradients(pixels: Pointer, at: int, width: int) -> tuple[Any, Any]:
+    """Twice the gradients (x, y) at 16 pixels of a row, at a distance of STRIDE, from one on."""
+    gx = subtract(load_every_second(pixels, at + 1), load_every_second(pixels, at - 1))
+    return gx, subtract(load_every_second(pixels, at + width), load_every_second(pixels, at - width))
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread(samples: Pointer, first: int, x: float, num: int, u: Any, v: Any) -> None:
+    """Fill what columns add to u and v: a factor each for the distance from x; none of those behind them is near."""
+    end = (num + WIDTH - 1) // WIDTH * WIDTH
+    for j in range(end):
+        dx = np.float32(first + STRIDE * j - x)
+        samples[_COLUMN_U + j] = u * dx if j < num else _AWAY
+        samples[_COLUMN_V + j] = v * dx if j < num else _AWAY
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample_circle(level: Floats, x: float, y: float, radius: int, scale: Any, room: Floats) -> int:
+    """Fill room with gradients, weighted by the table at so many squared pixels; returns how many."""
+    height, width = level.shape
+    pixels, samples = pointer(level), pointer(room)
+    xi, yi = round(x), round(y)
+    first, last = max(1, xi - radius), min(width - 1, xi + radius + 1)
+    columns = max(0, (last - first + STRIDE - 1) // STRIDE)
+    one = np.float32(1.0)
+    _spread(samples, first, x, columns, one, one)
+    factor, size = splat(scale), splat(np.float32(_EXP_SIZE))
+    num: Any = np.int64(0)  # a literal would have _polar compiled twice
+    for r in range(max(1, yi - radius), min(height - 1, yi + radius + 1), STRIDE):
+        dy = np.float32(r - y)
+        dy2 = splat(dy * dy)
+        inside = np.int64(0)
+        for j in range(0, columns, WIDTH):
+            dx = load(samples, _COLUMN_U + j)
+            near = multiply(add(multiply(dx, dx), dy2), factor)
+            store(samples, _COLUMN_V + j, near)
+            inside |= where_above(size, near) << j
+        if inside == 0:
+            continue
+        # they lie side by side
+        start, count = first_bit(np.uint64(inside)), np.int64(count_bits(np.uint64(inside)))
+        for j in range(0, count, WIDTH):
+            gx, gy = _gradients(pixels, r * width + first + STRIDE * (start + j), width)
+            store(samples, _GX + num + j, gx)
+            store(samples, _GY + num + j, gy)
+        for j in range(count):
+            weight = _EXP_TABLE[np.uint32(samples[_COLUMN_V + start + j])]
+            samples[_GX + num + j] *= weight
+            samples[_GY + num + j] *= weight
+        num += count
+    return int(num)
+
+
+@numba.njit(cache=True, nogil=True)
 def find_orientations(
-    level: Floats, x: float, y: float, sigma: float, max_num: int, samples: Floats, hist: NDArray[np.float64],
+    level: Floats, x: float, y: float, sigma: float, max_num: int, room: Floats, hist: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> int:  # fmt: skip
     """Peaks of the histogram of gradient directions around a keypoint, strongest first.
 
     Args:
-        level: (H, W) float32, the level of the scale space that the keypoint was found in.
+        level: (H, W) float32, the level of the scale space that the keypoint was found in, with at least SLACK floats
+            behind the last row, which are read and do not matter.
         x, y, sigma: of the keypoint, pixels.
-        samples: (4, MAX_SAMPLES) float32 and hist: (2, 36) float64, working memory.
+        room: (ROOM,) float32 and hist: (2, 36) float64, working memory.
         out: (max_num,) float64, filled with angles in radians in [0, 2 pi), from x towards y.
 
     Returns:
         Number of angles, at most max_num.
     """
-    height, width = level.shape
     num = _NUM_ORIENTATION_BINS
     window = 1.5 * sigma
-    radius = int(3.0 * window)
     scale = np.float32(_EXP_SIZE / (_EXP_MAX * 2.0 * window * window))
-    xi, yi = round(x), round(y)
-    num_samples: Any = np.int64(0)  # a literal would have _polar compiled twice
-    for r in range(max(1, yi - radius), min(height - 1, yi + radius + 1), STRIDE):
-        dy = np.float32(r - y)
-        before, row, after = level[r - 1], level[r], level[r + 1]
-        for c in range(max(1, xi - radius), min(width - 1, xi + radius + 1), STRIDE):
-            dx = np.float32(c - x)
-            k = int((dx * dx + dy * dy) * scale)
-            if k < _EXP_SIZE:
-                samples[2, num_samples] = _EXP_TABLE[k] * (row[c + 1] - row[c - 1])
-                samples[3, num_samples] = _EXP_TABLE[k] * (after[c] - before[c])
-                num_samples += 1
-    _polar(samples[2], samples[3], num_samples)
+    num_samples = _sample_circle(level, x, y, int(3.0 * window), scale, room)
+    length, direction = room[_GX:], room[_GY:]
+    _polar(length, direction, num_samples)
     hist[:] = 0.0
     for n in range(num_samples):
-        position = samples[3, n] * (num / (2.0 * math.pi))
+        position = direction[n] * (num / (2.0 * math.pi))
         b = int(position)
-        part = samples[2, n] * (position - b)
-        hist[0, b if b < num else b - num] += samples[2, n] - part
+        part = length[n] * (position - b)
+        hist[0, b if b < num else b - num] += length[n] - part
         hist[0, b + 1 if b + 1 < num else 0] += part
     return _find_peaks(hist, max_num, out)
 
 
 @numba.njit(cache=True, nogil=True)
-def _sample_cells(level: Floats, x: float, y: float, sigma: float, angle: float, samples: Floats) -> int:
-    """Fill samples (4, N) with the place in cells from the corner of the 6 x 6 (u, v) and the gradient (x, y), weighted
-    by a Gaussian with a sigma of two cells; returns how many."""
+def _sample_cells(level: Floats, x: float, y: float, sigma: float, angle: float, room: Floats) -> int:
+    """Fill room with places in cells from the corner of the 6 x 6 (u, v) and gradients (x, y), weighted by a Gaussian
+    with a sigma of two cells; returns how many."""
     height, width = level.shape
+    pixels, samples = pointer(level), pointer(room)
     cell = _CELL_SIGMAS * sigma
     cos, sin = np.float32(math.cos(angle) / cell), np.float32(math.sin(angle) / cell)
     reach = int(2.5 * cell * (abs(math.cos(angle)) + abs(math.sin(angle)))) + 1
     xi, yi = round(x), round(y)
-    scale = np.float32(_EXP_SIZE / (_EXP_MAX * 8.0))
-    half = np.float32(2.5)
+    first, last = max(1, xi - reach), min(width - 1, xi + reach + 1)
+    columns = max(0, (last - first + STRIDE - 1) // STRIDE)
+    _spread(samples, first, x, columns, cos, sin)
+    half, minus_half = splat(np.float32(2.5)), splat(np.float32(-2.5))
     num = 0
     for r in range(max(1, yi - reach), min(height - 1, yi + reach + 1), STRIDE):
         dy = np.float32(r - y)
-        before, row, after = level[r - 1], level[r], level[r + 1]
-        for c in range(max(1, xi - reach), min(width - 1, xi + reach + 1), STRIDE):
-            dx = np.float32(c - x)
-            u = cos * dx + sin * dy
-            v = cos * dy - sin * dx
-            if abs(u) < half and abs(v) < half:
-                weight = _EXP_TABLE[int((u * u + v * v) * scale)]
-                samples[0, num], samples[1, num] = u + half, v + half
-                samples[2, num] = weight * (row[c + 1] - row[c - 1])
-                samples[3, num] = weight * (after[c] - before[c])
-                num += 1
+        row_u, row_v = splat(sin * dy), splat(cos * dy)
+        inside = np.int64(0)
+        for j in range(0, columns, WIDTH):
+            u, v = add(load(samples, _COLUMN_U + j), row_u), subtract(row_v, load(samples, _COLUMN_V + j))
+            near = where_above(half, u) & where_above(u, minus_half)
+            inside |= (near & where_above(half, v) & where_above(v, minus_half)) << j
+        if inside == 0:
+            continue
+        # they lie side by side
+        start, count = first_bit(np.uint64(inside)), int(count_bits(np.uint64(inside)))
+        for j in range(0, count, WIDTH):
+            at = start + j
+            u, v = add(load(samples, _COLUMN_U + at), row_u), subtract(row_v, load(samples, _COLUMN_V + at))
+            gx, gy = _gradients(pixels, r * width + first + STRIDE * at, width)
+            weight = _gaussian(multiply(splat(np.float32(1.0 / 32.0)), fma(u, u, multiply(v, v))))
+            store(samples, _U + num + j, add(u, half))
+            store(samples, _V + num + j, add(v, half))
+            store(samples, _GX + num + j, multiply(weight, gx))
+            store(samples, _GY + num + j, multiply(weight, gy))
+        num += count
     return num
 
 
 @numba.njit(cache=True, nogil=True)
+def _gaussian(quarter: Any) -> Any:
+    """exp(-4 q) of rows of numbers in [0, 0.4], to 2e-5: the fourth power of five terms of the series."""
+    value = fma(quarter, splat(np.float32(-1.0 / 120.0)), splat(np.float32(1.0 / 24.0)))
+    value = fma(quarter, value, splat(np.float32(-1.0 / 6.0)))
+    value = fma(quarter, value, splat(np.float32(0.5)))
+    value = fma(quarter, value, splat(np.float32(-1.0)))
+    value = fma(quarter, value, splat(np.float32(1.0)))
+    value = multiply(value, value)
+    return multiply(value, value)
+
+
+@numba.njit(cache=True, nogil=True)
+def _share_out(samples: Pointer, start: Any, num: int) -> None:
+    """Replace places by how far they are from the left of their square and gradients (length, direction) by what the
+    upper and the lower cells get, and fill in square, direction (places of their vectors) and what the next gets."""
+    to_eighths = np.float32(8.0 / (2.0 * math.pi))
+    for n in range(num):
+        u, v, weight = samples[_U + n], samples[_V + n], samples[_GX + n]
+        turn = start - samples[_GY + n] * to_eighths
+        iu, iv, it = np.int32(u), np.int32(v), np.int32(turn)
+        below = weight * (v - np.float32(iv))
+        samples[_U + n] = u - np.float32(iu)
+        samples[_V + n] = turn - np.float32(it)
+        samples[_GX + n] = weight - below
+        samples[_GY + n] = below
+        samples[_SQUARE + n] = np.float32((np.int32(5) * iv + iu) * np.int32(_PER_SQUARE))
+        samples[_DIRECTION + n] = np.float32((it & np.int32(7)) * np.int32(WIDTH))
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_histogram(samples: Pointer, num: int) -> None:
+    """Enter what :func:`_share_out` has made of the samples."""
+    one_hot, to_next = pointer(_ONE_HOT), pointer(_TO_NEXT)
+    left, to_right = load(pointer(_LEFT), 0), load(pointer(_TO_RIGHT), 0)
+    zero = splat(np.float32(0.0))
+    for n in range(0, 25 * _PER_SQUARE, WIDTH):
+        store(samples, _HISTOGRAM + n, zero)
+    for n in range(num):
+        direction, above = int(samples[_DIRECTION + n]), _HISTOGRAM + int(samples[_SQUARE + n])
+        share = fma(splat(samples[_V + n]), load(to_next, direction), load(one_hot, direction))
+        share = multiply(share, fma(splat(samples[_U + n]), to_right, left))
+        store(samples, above, fma(share, splat(samples[_GX + n]), load(samples, above)))
+        below = above + WIDTH
+        store(samples, below, fma(share, splat(samples[_GY + n]), load(samples, below)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _join_squares(samples: Pointer) -> None:
+    """Fill the 4 x 4 cells inside, each a corner of four squares."""
+    to = _CELLS
+    for i in range(1, 5):
+        for j in range(1, 5):
+            # upper left corner of its own square, upper right of that to the left, and so on
+            here = _HISTOGRAM + (5 * i + j) * _PER_SQUARE
+            above = here - 5 * _PER_SQUARE + WIDTH
+            for k in range(8):
+                upper = samples[here + k] + samples[here - _PER_SQUARE + 8 + k]
+                samples[to + k] = upper + (samples[above + k] + samples[above - _PER_SQUARE + 8 + k])
+            to += 8
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _root(samples: Pointer, out: NDArray[np.uint8]) -> None:
+    """RootSIFT of the histogram, times 512; no single gradient may dominate (Lowe, section 6.1)."""
+    square = splat(np.float32(0.0))
+    for n in range(_CELLS, _CELLS + 128, WIDTH):
+        value = load(samples, n)
+        square = fma(value, value, square)
+    limit = splat(np.float32(0.2) * np.sqrt(total(square)))
+    length = splat(np.float32(0.0))
+    for n in range(_CELLS, _CELLS + 128, WIDTH):
+        value = smaller(load(samples, n), limit)
+        store(samples, n, value)
+        length = add(length, value)
+    scale = np.float32(512.0 * 512.0) / (total(length) + np.float32(1e-30))
+    to = pointer(out)
+    for n in range(128):
+        to[n] = np.uint8(min(np.sqrt(samples[_CELLS + n] * scale) + np.float32(0.5), np.float32(255.0)))
+
+
+@numba.njit(cache=True, nogil=True)
 def describe(
-    level: Floats, x: float, y: float, sigma: float, angle: float, samples: Floats, hist: Floats,
-    out: NDArray[np.uint8],
+    level: Floats, x: float, y: float, sigma: float, angle: float, room: Floats, out: NDArray[np.uint8]
 ) -> None:  # fmt: skip
     """RootSIFT descriptor: 4 x 4 cells of 8 directions, in the order of COLMAP's.
 
     Args:
-        level: (H, W) float32, the level of the scale space that the keypoint was found in.
+        level: (H, W) float32, the level of the scale space that the keypoint was found in, with at least SLACK floats
+            behind the last row, which are read and do not matter.
         x, y, sigma: of the keypoint, pixels; angle: radians, from x towards y.
-        samples: (4, MAX_SAMPLES) and hist: (36, 8) float32, working memory.
+        room: (ROOM,) float32, working memory.
         out: (128,) uint8, filled.
     """
-    num = _sample_cells(level, x, y, sigma, angle, samples)
-    _polar(samples[2], samples[3], num)
-    to_eighths, start = np.float32(8.0 / (2.0 * math.pi)), np.float32(angle * 8.0 / (2.0 * math.pi) + 8.0)
-    hist[:] = 0.0
-    for n in range(num):
-        u, v, weight = samples[0, n], samples[1, n], samples[2, n]
-        turn = start - samples[3, n] * to_eighths
-        iu, iv, it = int(u), int(v), int(turn)
-        fu, fv, ft = u - iu, v - iv, turn - it
-        t0, t1 = it & 7, (it + 1) & 7
-        w1 = weight * fv
-        w0 = weight - w1
-        w01 = w0 * fu
-        w00 = w0 - w01
-        w11 = w1 * fu
-        w10 = w1 - w11
-        k = iv * 6 + iu
-        a, b = w00 * ft, w01 * ft
-        hist[k, t0] += w00 - a
-        hist[k, t1] += a
-        hist[k + 1, t0] += w01 - b
-        hist[k + 1, t1] += b
-        a, b = w10 * ft, w11 * ft
-        hist[k + 6, t0] += w10 - a
-        hist[k + 6, t1] += a
-        hist[k + 7, t0] += w11 - b
-        hist[k + 7, t1] += b
-    square = 0.0
-    for i in range(1, 5):
-        for j in range(1, 5):
-            for k in range(8):
-                square += hist[i * 6 + j, k] * hist[i * 6 + j, k]
-    # no single gradient may dominate (Lowe, section 6.1)
-    limit = 0.2 * math.sqrt(square)
-    total = 1e-30
-    for i in range(1, 5):
-        for j in range(1, 5):
-            for k in range(8):
-                hist[i * 6 + j, k] = min(hist[i * 6 + j, k], limit)
-                total += hist[i * 6 + j, k]
-    for i in range(4):
-        for j in range(4):
-            for k in range(8):
-                root = 512.0 * math.sqrt(hist[i * 6 + j + 7, k] / total)
-                out[(i * 4 + j) * 8 + k] = min(255, int(root + 0.5))
+    num = _sample_cells(level, x, y, sigma, angle, room)
+    _polar(room[_GX:], room[_GY:], num)
+    samples = pointer(room)
+    _share_out(samples, np.float32(angle * 8.0 / (2.0 * math.pi) + 8.0), num)
+    _fill_histogram(samples, num)
+    _join_squares(samples)
+    _root(samples, out)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -236,13 +369,13 @@ def orient_all(
         angles: (N, max_num) float64, filled, strongest first; NaN where there are fewer.
     """
     hist = np.empty((2, _NUM_ORIENTATION_BINS))
-    samples = np.empty((4, MAX_SAMPLES), np.float32)
+    room = np.empty(ROOM, np.float32)
     angles[:] = np.nan
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
         x, y = found[n, 0], found[n, 1] - top
-        find_orientations(levels[layer - 1], x, y, sigma, max_num, samples, hist, angles[n])
+        find_orientations(levels[layer - 1], x, y, sigma, max_num, room, hist, angles[n])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -257,9 +390,8 @@ def describe_all(
         found: (N, >= 3) float64 column, row, layer; angle: (N,) radians.
         out: (N, 128) uint8, filled.
     """
-    hist = np.empty((36, 8), np.float32)
-    samples = np.empty((4, MAX_SAMPLES), np.float32)
+    room = np.empty(ROOM, np.float32)
     for n in range(found.shape[0]):
         layer = min(max(round(found[n, 2]), 1), NUM_LAYERS)
         sigma = SIGMA * 2.0 ** (found[n, 2] / NUM_LAYERS)
-        describe(levels[layer - 1], found[n, 0], found[n, 1] - top, sigma, angle[n], samples, hist, out[n])
+        describe(levels[layer - 1], found[n, 0], found[n, 1] - top, sigma, angle[n], room, out[n])

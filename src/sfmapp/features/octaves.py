@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features import scale_space
-from sfmapp.features.scale_space import NUM_LAYERS, NUM_LEVELS, SIGMA
+from sfmapp.features.scale_space import NUM_LAYERS, NUM_LEVELS, SIGMA, SLACK
 
 # pixels of the first octave in one pixel of the image
 UPSAMPLING = 2
@@ -37,8 +37,6 @@ _LEAST_ROWS = 32
 _ROWS_AT_A_TIME = 64
 # pixels around a place that is looked up by itself
 _LOOK_UP_PX = 8
-# kernels read whole vectors, and with the last of a row what lies behind it
-_SLACK = 16
 
 FloatImage = NDArray[np.float32]
 
@@ -93,9 +91,9 @@ class Scratch:
         return tuple(flat[start:].reshape(num_levels, *shape))
 
     def _take(self, pool: str, size: int) -> FloatImage:
-        if len(self._pools.get(pool, ())) < size + _SLACK:
+        if len(self._pools.get(pool, ())) < size + SLACK:
             self._pools.pop(pool, None)
-            self._pools[pool] = np.empty(size + _SLACK, np.float32)
+            self._pools[pool] = np.empty(size + SLACK, np.float32)
         return self._pools[pool][:size]
 
 
@@ -239,7 +237,7 @@ def _doubled_rows(gray: NDArray[np.uint8], first: int, last: int) -> tuple[Float
 def _blur(
     image: FloatImage, taps: FloatImage, target: FloatImage, rows: tuple[int, int, int], tops: tuple[int, int]
 ) -> None:
-    scale_space.blur(image, taps, np.empty(image.shape[1] + 2 * len(taps), np.float32), target, rows, tops)
+    scale_space.blur(image, taps, scale_space.empty_lines(image.shape[1]), target, rows, tops)
 
 
 def _gaussian(sigma: float) -> FloatImage:

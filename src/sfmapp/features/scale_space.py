@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 
 from sfmapp.simd.f32x16 import (
     WIDTH,
+    fma,
     larger,
     load,
     smaller,
     splat,
     store,
     subtract,
+    summing_along,
     where_above,
     where_at_least,
 )
-from sfmapp.simd.pointers import Pointer, pointer
+from sfmapp.simd.pointers import Pointer, offset, pointer
 
 NUM_LAYERS = 3
 NUM_LEVELS = NUM_LAYERS + 3
@@ -34,117 +36,180 @@ BORDER = 5
 # columns that are scanned together, so that the rows at work stay in the cache, and floats from one row to the next
 TILE = 512
 PITCH = TILE + 2 * WIDTH
-# rows at work: three of each difference, then their extremes
+# rows at work: three of each difference, then the extremes of each layer
 _EXTREMES = 3 * NUM_DIFFERENCES
-NUM_ROWS_AT_WORK = _EXTREMES + 2 * NUM_DIFFERENCES
+NUM_ROWS_AT_WORK = _EXTREMES + 2 * NUM_LAYERS
+# kernels read whole vectors, and with the last of a row what lies behind it: floats behind the last row of a level
+SLACK = 3 * WIDTH
+# rows that are blurred together, and sums along a row of so many pixels on either side
+ROWS_AT_ONCE = 4
+_SHORT, _LONG = 6, 10
+_sum_along_short, _sum_along_long = summing_along(_SHORT), summing_along(_LONG)
 # moves of a keypoint while it is refined
 _NUM_ROUNDS = 5
 
 Floats = NDArray[np.float32]
 
 
-@numba.njit(cache=True, nogil=True)
-def _taps_0_to_4(
-    out: Floats, k: Floats, m: Floats, a1: Floats, b1: Floats, a2: Floats, b2: Floats, a3: Floats,
-    b3: Floats, a4: Floats, b4: Floats, num: int,
-) -> None:  # fmt: skip
-    k0, k1, k2, k3, k4 = k[0], k[1], k[2], k[3], k[4]
-    for c in range(num):
-        near = k0 * m[c] + k1 * (a1[c] + b1[c]) + k2 * (a2[c] + b2[c])
-        out[c] = near + (k3 * (a3[c] + b3[c]) + k4 * (a4[c] + b4[c]))
+def empty_level(shape: tuple[int, int]) -> Floats:
+    """Memory for a level (H, W), with what kernels read behind its last row."""
+    return np.empty(shape[0] * shape[1] + SLACK, np.float32)[: shape[0] * shape[1]].reshape(shape)
+
+
+def empty_lines(width: int) -> Floats:
+    """Memory for rows that :func:`blur` has at work."""
+    # zeros, as what lies beside a row of it is multiplied by zero
+    return np.zeros((ROWS_AT_ONCE, (width // WIDTH + 4) * WIDTH), np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
-def _two_taps(out: Floats, k: Floats, a1: Floats, b1: Floats, a2: Floats, b2: Floats, num: int) -> None:
-    k1, k2 = k[0], k[1]
-    for c in range(num):
-        out[c] += k1 * (a1[c] + b1[c]) + k2 * (a2[c] + b2[c])
+def _sum_down(
+    source: Pointer, weights: Pointer, steps: Pointer, at: int, target: Pointer, to: int, pitch: int, num: int
+) -> None:
+    """Fill 32 pixels in each of four rows, ``pitch`` apart, with the weighted sums of those above and below.
+
+    Args:
+        weights: (num,) those of the last row; those of the one before begin one further on, and so on.
+        steps: (num,) places in source of the rows' first pixels, from the uppermost on.
+        at: column. to: place in target.
+    """
+    a0 = a1 = b0 = b1 = c0 = c1 = d0 = d1 = splat(np.float32(0.0))
+    for j in range(num):
+        place = steps[j] + at
+        x, y = load(source, place), load(source, place + WIDTH)
+        w = splat(weights[j + 3])
+        a0, a1 = fma(w, x, a0), fma(w, y, a1)
+        w = splat(weights[j + 2])
+        b0, b1 = fma(w, x, b0), fma(w, y, b1)
+        w = splat(weights[j + 1])
+        c0, c1 = fma(w, x, c0), fma(w, y, c1)
+        w = splat(weights[j])
+        d0, d1 = fma(w, x, d0), fma(w, y, d1)
+    store(target, to, a0)
+    store(target, to + WIDTH, a1)
+    store(target, to + pitch, b0)
+    store(target, to + pitch + WIDTH, b1)
+    store(target, to + 2 * pitch, c0)
+    store(target, to + 2 * pitch + WIDTH, c1)
+    store(target, to + 3 * pitch, d0)
+    store(target, to + 3 * pitch + WIDTH, d1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_down_narrow(
+    source: Pointer, weights: Pointer, steps: Pointer, width: int, target: Pointer, to: int, pitch: int, num: int
+) -> None:
+    """:func:`_sum_down` where a row has no 32 pixels."""
+    for r in range(ROWS_AT_ONCE):
+        for c in range(width):
+            value = np.float32(0.0)
+            for j in range(num):
+                value += weights[j + ROWS_AT_ONCE - 1 - r] * source[steps[j] + c]
+            target[to + r * pitch + c] = value
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_along(line: Pointer, weights: Pointer, reach: int, width: int, target: Pointer, to: int) -> None:
+    """Fill a row with weighted sums of what is left and right of each pixel; a line begins WIDTH before its first."""
+    for c in range(0, width, WIDTH):
+        if reach <= _SHORT:
+            value = _sum_along_short(line, WIDTH + c, weights)
+        else:
+            value = _sum_along_long(line, WIDTH + c, weights)
+        if c + WIDTH <= width:
+            store(target, to + c, value)
+        else:
+            store(line, 0, value)
+            for i in range(width - c):
+                target[to + c + i] = line[i]
 
 
 @numba.njit(cache=True, nogil=True)
 def blur(
-    source: Floats, k: Floats, line: Floats, target: Floats, rows: tuple[int, int, int], tops: tuple[int, int]
+    source: Floats, k: Floats, lines: Floats, target: Floats, rows: tuple[int, int, int], tops: tuple[int, int]
 ) -> None:
     """Convolve columns, then rows, with a symmetric kernel; the image is mirrored at the centres of its outer pixels.
 
-    A quarter to a half faster than OpenCV's, and the same to the last bit on any processor, as no multiplication is
-    fused with an addition, and for any division of the image into rows.
+    The same to the last bit for any division of the image into rows.
 
     Args:
         source: (R, W) float32, rows of an image (H, W) with H and W at least N: those to blur and N - 1 on either
             side, where the image has them.
-        k: (N,) float32, the kernel from its middle outwards; N is odd and at least 5.
-        line: (W + 2 N,) float32, working memory.
+        k: (N,) float32, the kernel from its middle outwards; N is at most 11.
+        lines: (ROWS_AT_ONCE, at least W + 4 WIDTH) float32, working memory.
         target: (T, W) float32, the rows to blur are filled; not the source.
         rows: first row of the image to blur, the one behind the last, and H.
         tops: which rows of the image the first ones of source and target are.
     """
     first, last, h = rows
     top, target_top = tops
-    w = source.shape[1]
-    n = k.shape[0] - 1
-    s = source
-    for r in range(first, last):
-        column, out = line[n : n + w], target[r - target_top]
-        up, down = r, 2 * h - 2 - r
-        _taps_0_to_4(
-            column, k, s[r - top],
-            s[abs(up - 1) - top], s[min(r + 1, down - 1) - top], s[abs(up - 2) - top], s[min(r + 2, down - 2) - top],
-            s[abs(up - 3) - top], s[min(r + 3, down - 3) - top], s[abs(up - 4) - top], s[min(r + 4, down - 4) - top], w,
-        )  # fmt: skip
-        for i in range(5, n, 2):
-            _two_taps(
-                column, k[i:], s[abs(up - i) - top], s[min(r + i, down - i) - top],
-                s[abs(up - i - 1) - top], s[min(r + i + 1, down - i - 1) - top], w,
-            )  # fmt: skip
-        for i in range(1, n + 1):
-            line[n - i] = line[n + i]
-            line[n + w - 1 + i] = line[n + w - 1 - i]
-        _taps_0_to_4(
-            out, k, column, line[n - 1 :], line[n + 1 :], line[n - 2 :], line[n + 2 :],
-            line[n - 3 :], line[n + 3 :], line[n - 4 :], line[n + 4 :], w,
-        )  # fmt: skip
-        for i in range(5, n, 2):
-            _two_taps(out, k[i:], line[n - i :], line[n + i :], line[n - i - 1 :], line[n + i + 1 :], w)
+    w, n, pitch = source.shape[1], k.shape[0] - 1, lines.shape[1]
+    pixels, line, out = pointer(source), pointer(lines), pointer(target)
+    # the taps, with zeros beside: for rows that are not a pixel's own, and for the longer sums along rows
+    reach = _SHORT if n <= _SHORT else _LONG
+    taps = np.zeros(2 * (reach + ROWS_AT_ONCE) - 1, np.float32)
+    middle = reach + ROWS_AT_ONCE - 1
+    for i in range(n + 1):
+        taps[middle - i] = taps[middle + i] = k[i]
+    num = 2 * n + ROWS_AT_ONCE
+    places = np.empty(num, np.int64)
+    weights, steps = pointer(taps), pointer(places)
+    for start in range(first, last, ROWS_AT_ONCE):
+        for j in range(num):
+            # rows behind the last are no pixel's own
+            r = min(start - n + j, last - 1 + n)
+            places[j] = (min(abs(r), 2 * h - 2 - r) - top) * w
+        down = offset(weights, reach - n)
+        if w < 2 * WIDTH:
+            _sum_down_narrow(pixels, down, steps, w, line, WIDTH, pitch, num)
+        else:
+            for c in range(0, w, 2 * WIDTH):
+                # the last ones once more, in place of pixels that are not there
+                c = min(c, w - 2 * WIDTH)
+                _sum_down(pixels, down, steps, c, line, WIDTH + c, pitch, num)
+        for r in range(start, min(start + ROWS_AT_ONCE, last)):
+            row = (r - start) * pitch + WIDTH
+            for i in range(1, n + 1):
+                line[row - i] = line[row + i]
+                line[row + w - 1 + i] = line[row + w - 1 - i]
+            beside = offset(weights, ROWS_AT_ONCE - 1)
+            _sum_along(offset(line, row - WIDTH), beside, n, w, out, (r - target_top) * w)
+    # the pointers are used up
+    taps[0] = lines[0, 0] = places[0]
 
 
 @numba.njit(cache=True, nogil=True)
 def _differences(levels: tuple[Pointer, ...], at: int, rows: Pointer, middle: int, num: int) -> None:
-    """Fill the row after ``middle`` of the five differences, and the largest and smallest of their last three rows."""
+    """Fill the row after ``middle`` of the five differences, and for each layer the largest and smallest of the last
+    three rows of its own difference and those beside it."""
     new, old = (middle + 1) % 3 * PITCH, (middle + 2) % 3 * PITCH
     for c in range(0, num, WIDTH):
         lower = load(levels[0], at + c)
+        most = least = most_of_two = least_of_two = lower
         for d in range(NUM_DIFFERENCES):
             upper = load(levels[d + 1], at + c)
-            value, ring, extremes = subtract(upper, lower), 3 * d * PITCH + c, (_EXTREMES + 2 * d) * PITCH + c
+            value, ring = subtract(upper, lower), 3 * d * PITCH + c
             store(rows, ring + new, value)
             a, b = load(rows, ring + old), load(rows, ring + middle * PITCH)
-            store(rows, extremes, larger(larger(a, b), value))
-            store(rows, extremes + PITCH, smaller(smaller(a, b), value))
-            lower = upper
-
-
-@numba.njit(cache=True, nogil=True)
-def _around(rows: Pointer, at: int) -> tuple[Any, Any]:
-    """The largest and smallest of 3 x 3 values of a difference, whose extremes of columns begin at a place."""
-    most = larger(larger(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
-    at += PITCH
-    return most, smaller(smaller(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
+            high, low = larger(larger(a, b), value), smaller(smaller(a, b), value)
+            if d > 1:
+                extremes = (_EXTREMES + 2 * (d - 2)) * PITCH + c
+                store(rows, extremes, larger(most_of_two, high))
+                store(rows, extremes + PITCH, smaller(least_of_two, low))
+            most_of_two, least_of_two = larger(most, high), smaller(least, low)
+            most, least, lower = high, low, upper
 
 
 @numba.njit(cache=True, nogil=True)
 def _mark_extremes(rows: Pointer, middle: int, low: Any, high: Any, marks: Pointer, num: int) -> None:
     """Marks (C, 3): of every 16 pixels and each layer the bits of those that are extremes and far enough from zero."""
     for c in range(0, num, WIDTH):
-        at = _EXTREMES * PITCH + c
-        near = (
-            _around(rows, at), _around(rows, at + 2 * PITCH), _around(rows, at + 4 * PITCH),
-            _around(rows, at + 6 * PITCH), _around(rows, at + 8 * PITCH),
-        )  # fmt: skip
         for layer in range(1, NUM_LAYERS + 1):
+            at = (_EXTREMES + 2 * (layer - 1)) * PITCH + c
+            most = larger(larger(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
+            at += PITCH
+            least = smaller(smaller(load(rows, at), load(rows, at + 1)), load(rows, at + 2))
             v = load(rows, (3 * layer + middle) * PITCH + c + 1)
-            most = larger(larger(near[layer - 1][0], near[layer][0]), near[layer + 1][0])
-            least = smaller(smaller(near[layer - 1][1], near[layer][1]), near[layer + 1][1])
             peaks = where_at_least(v, most) & where_above(v, low)
             marks[c // WIDTH * NUM_LAYERS + layer - 1] = peaks | (where_at_least(least, v) & where_above(high, v))
 
@@ -157,12 +222,12 @@ def find_extrema(
     """Pixels whose difference of Gaussians is the largest or smallest of its 26 neighbours and exceeds the threshold.
 
     Args:
-        levels: the six levels of an octave, (R, W) float32 each, with at least 16 floats behind the last row, which
-            are read and do not matter.
+        levels: the six levels of an octave, (R, W) float32 each, with SLACK floats behind the last row, which are
+            read and do not matter.
         span: which row of the octave they begin with, the first row to search, and the one behind the last.
         threshold: grey levels.
-        rows: (25, PITCH) float32 and marks: (PITCH,) int64, working memory: the last three rows of the five
-            differences, then of each the largest and the smallest of three.
+        rows: (21, PITCH) float32 and marks: (PITCH,) int64, working memory: the last three rows of the five
+            differences, then for each layer the largest and the smallest of nine.
         place: (C, 4) int32 and value: (C,) float32, filled with layer, row, column, the rounds of refinement that it
             may have, and the absolute difference.
 
@@ -201,7 +266,9 @@ def find_extrema(
 
 
 @numba.njit(cache=True, nogil=True)
-def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArray[np.float64]) -> bool:
+def _locate(
+    d: NDArray[np.float64], p: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArray[np.float64]
+) -> bool:
     """Place and height of the summit at a given scale.
 
     The fit over place and scale at once takes the curvature in the plane to be the same at all scales, though it falls
@@ -209,13 +276,13 @@ def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArr
     to the scale, and the place is found among those nine.
 
     Args:
-        d: (3, 3, 3) differences by layer, row, column; ds: scale in layers from the middle one.
+        d: (3, 3, 3) differences by layer, row, column; p: (3, 3), working memory.
+        ds: scale in layers from the middle one.
         out: filled with column and row from the middle one, and at 3 with the absolute height.
 
     Returns:
         Whether it is a summit, within a pixel, and not on an edge.
     """
-    p = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             slope = 0.5 * (d[2, i, j] - d[0, i, j])
@@ -234,7 +301,7 @@ def _locate(d: NDArray[np.float64], ds: float, edge_threshold: float, out: NDArr
 @numba.njit(cache=True, nogil=True)
 def refine_extremum(
     levels: tuple[Floats, ...], origin: tuple[int, int], shape: tuple[int, int], place: NDArray[np.int32],
-    edge_threshold: float, out: NDArray[np.float64],
+    edge_threshold: float, d: NDArray[np.float64], out: NDArray[np.float64],
 ) -> bool:  # fmt: skip
     """Fit a parabola to the 27 differences around a pixel (Brown and Lowe, BMVC 2002), moving on while it lies outside.
 
@@ -244,6 +311,7 @@ def refine_extremum(
         place: (4,) layer, row, column and rounds that are left, which are more than 0 afterwards only if it moved out
             of the levels: then it can go on there with others.
         edge_threshold: largest ratio of the principal curvatures.
+        d: (4, 3, 3), working memory.
         out: (4,) float64, filled with column, row, layer (all with fractions) and absolute difference there.
 
     Returns:
@@ -253,7 +321,6 @@ def refine_extremum(
     num_rows, num_cols = levels[0].shape
     layer, row, col, rounds = place[0], place[1], place[2], place[3]
     place[3] = 0
-    d = np.empty((3, 3, 3))
     while rounds > 0:
         top, left = row - 1 - origin[0], col - 1 - origin[1]
         if top < 0 or left < 0 or top + 3 > num_rows or left + 3 > num_cols:
@@ -285,7 +352,7 @@ def refine_extremum(
         dy = -(gx * c1 + gy * (xx * ss - xs * xs) + gs * (xy * xs - xx * ys)) / det
         ds = -(gx * c2 + gy * (xy * xs - xx * ys) + gs * (xx * yy - xy * xy)) / det
         if abs(dx) < 0.6 and abs(dy) < 0.6 and abs(ds) < 0.6:
-            if not _locate(d, ds, edge_threshold, out):
+            if not _locate(d, d[3], ds, edge_threshold, out):
                 return False
             out[0] += col
             out[1] += row
@@ -307,6 +374,7 @@ def refine_all(
     edge_threshold: float, out: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """:func:`refine_extremum` of every place (N, 4); rows of out (N, 4) that fail become NaN."""
+    d = np.empty((4, 3, 3))
     for n in range(place.shape[0]):
-        if not refine_extremum(levels, origin, shape, place[n], edge_threshold, out[n]):
+        if not refine_extremum(levels, origin, shape, place[n], edge_threshold, d, out[n]):
             out[n, :] = np.nan

@@ -46,6 +46,19 @@ def load(typingctx: Any, base: Any, index: Any) -> Any:
 
 
 @intrinsic
+def load_every_second(typingctx: Any, base: Any, index: Any) -> Any:
+    """``base[index : index + 32 : 2]`` of a pointer to float32; all 32 are read."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        base, index = args
+        after = builder.add(index, llvm.int64(WIDTH))
+        parts = [llvm.load(builder, builder.gep(base, [place]), FLOATS, 4) for place in (index, after)]
+        return builder.shuffle_vector(*parts, ir.Constant(INTS, list(range(0, 2 * WIDTH, 2))))
+
+    return row(base, types.intp), codegen
+
+
+@intrinsic
 def load_bytes(typingctx: Any, base: Any, index: Any) -> Any:
     """``base[index : index + 16]`` of a pointer to uint8, as floats."""
 
@@ -88,6 +101,32 @@ def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
         return llvm.fma(builder, *args)
 
     return row(a, b, c), codegen
+
+
+def summing_along(reach: int) -> Any:
+    """An intrinsic (base, index, weights) -> row: the sums of ``weights[n] * base[index + n - reach + lane]`` over all
+    n up to 2 reach; base and weights are pointers to float32, and reach is at most 16.
+
+    Loads that begin between lines of the cache cost twice as much as others, so neighbours come out of three.
+    """
+
+    @intrinsic
+    def sum_along(typingctx: Any, base: Any, index: Any, weights: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            base, index, weights = args
+            places = [builder.add(index, llvm.int64(step)) for step in (-WIDTH, 0, WIDTH)]
+            before, here, after = (llvm.load(builder, builder.gep(base, [place]), FLOATS, 4) for place in places)
+            value = llvm.constant(FLOATS, 0.0)
+            for n in range(-reach, reach + 1):
+                pair, first = ((before, here), WIDTH + n) if n < 0 else ((here, after), n)
+                moved = builder.shuffle_vector(*pair, ir.Constant(INTS, list(range(first, first + WIDTH))))
+                weight = builder.load(builder.gep(weights, [llvm.int64(n + reach)]))
+                value = llvm.fma(builder, llvm.splat(builder, weight, FLOATS), moved, value)
+            return value
+
+        return row(base, types.intp, weights), codegen
+
+    return sum_along
 
 
 def _binary(operation: str) -> Callable[..., Any]:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.features import scale_space
-from sfmapp.features.descriptor import MAX_SAMPLES, describe
+from sfmapp.features.descriptor import ROOM, describe
 from sfmapp.matching.pairs import PairOptions, image_vector, learn_vocabulary
 from sfmapp.scene.features import Features
 
@@ -335,10 +335,9 @@ def _learn(places: Sequence[Place], options: PlaceOptions, seed: int) -> _Vocabu
 @numba.njit(cache=True, nogil=True)
 def _describe_at(level: Floats, place: Array, sigma: Array, angle: Array, out: Bytes) -> None:
     """Descriptors (N, 128) at pixels (N, 2) of a level, whose first pixel has its centre at (0, 0)."""
-    samples = np.empty((4, MAX_SAMPLES), np.float32)
-    hist = np.empty((36, 8), np.float32)
+    room = np.empty(ROOM, np.float32)
     for n in range(place.shape[0]):
-        describe(level, place[n, 0], place[n, 1], sigma[n], angle[n], samples, hist, out[n])
+        describe(level, place[n, 0], place[n, 1], sigma[n], angle[n], room, out[n])
 
 
 def _pyramid(image: Bytes) -> list[Floats]:
@@ -352,9 +351,9 @@ def _pyramid(image: Bytes) -> list[Floats]:
         if k:
             half = (image.shape[1] // 2, image.shape[0] // 2)
             image = cv2.resize(image[: 2 * half[1], : 2 * half[0]], half, interpolation=cv2.INTER_AREA)
-        blurred = np.empty(image.shape, np.float32)
-        line = np.empty(image.shape[1] + 2 * len(taps), np.float32)
-        scale_space.blur(image.astype(np.float32), taps, line, blurred, (0, len(image), len(image)), (0, 0))
+        blurred = scale_space.empty_level((image.shape[0], image.shape[1]))
+        lines = scale_space.empty_lines(image.shape[1])
+        scale_space.blur(image.astype(np.float32), taps, lines, blurred, (0, len(image), len(image)), (0, 0))
         levels.append(blurred)
     return levels
 
