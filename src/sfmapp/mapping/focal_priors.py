@@ -63,6 +63,8 @@ class Mapped:
     mapper_of: Callable[..., Mapper]
     apart: list[str]
     """Of each model why it is not one with another."""
+    enough: float
+    """Share of the matches that has to agree with a model of these pairs, so that no other start is tried."""
     without_prior: tuple[int, ...] = ()
     """Cameras that it began with as unknown although a focal length was given."""
 

@@ -35,7 +35,7 @@ from sfmapp.mapping.merge import find_merge, merge, num_linking_points
 from sfmapp.mapping.moving_planes import without_moving_planes
 from sfmapp.mapping.one_place import OnePlace, find_one_place
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.mapping.register import Registration, rank_next_images
+from sfmapp.mapping.register import NextImages, Registration
 from sfmapp.mapping.repair import repaired
 from sfmapp.mapping.report import FocalReport, InitialPairReport, MappedImage, MappingReport, ModelReport, StartReport
 from sfmapp.mapping.tracks import build_tracks, track_colors
@@ -52,6 +52,10 @@ ENOUGH_AGREEMENT = 0.95
 WEIGHT_AGAINST = 3.0
 # Starts of one model.
 MAX_STARTS = 3
+# Two starts whose models hold the same images, and which agree with as many of the matches but for this share of them,
+# have come to the same: what does not agree are pairs of things that look alike, and no third start would help. On
+# streets with terraces of equal houses three starts differ by 0.0003, a start that has bent its map by 0.2.
+SAME_AGREEMENT = 0.005
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ def map_images(
         mapped = settle_focal_lengths(first_map, map_all, events)
 
         def map_again(found: Correspondences) -> Mapped:
-            return task.map_from(list(mapped.cameras), found, build_tracks(found, features)[0])
+            return task.map_from(list(mapped.cameras), found, build_tracks(found, features)[0], enough=mapped.enough)
 
         mapped, look_alikes = tell_apart(mapped, correspondences, map_again, events)
         models = mapped.models
@@ -171,9 +175,10 @@ class _Task:
 
     def map_from(
         self, given: list[Camera], correspondences: Correspondences, tracks: Tracks,
-        ends: Ends | None = None,
+        ends: Ends | None = None, enough: float = ENOUGH_AGREEMENT,
     ) -> Mapped:  # fmt: skip
-        """Models that begin with the given cameras, from verified matches and their tracks, or with finished ones."""
+        """Models that begin with the given cameras, from verified matches and their tracks, or with finished ones;
+        ``enough`` is the share of the matches that has to agree with a model so that no other start is tried."""
         names, options, events = self.names, self.options, self.events
         events.started(STAGE, "mapping", total=len(names))
         cameras, focal_report = first_cameras(given, self.image_camera_idx, correspondences, tracks, options, events)
@@ -190,11 +195,12 @@ class _Task:
         empty = Reconstruction.empty(cameras, names, self.image_camera_idx, tracks)
         begun = [carried(model, empty) for model in ends.start] if ends is not None else []
         is_apart = ends is not None and ends.is_apart
-        models, initial_reports = _grow_models(empty, mapper_of, options, events, begun, is_apart=is_apart)
+        starts = Starts(options, events, enough)
+        models, initial_reports = _grow_models(empty, mapper_of, starts, begun, is_apart=is_apart)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
         models = [repaired(model, correspondences, mapper_of, options, events) for model in models]
-        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart)
+        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart, starts.enough)
 
 
 def _model_report(
@@ -211,8 +217,34 @@ def _model_report(
     return ModelReport(**summary, uncertainty=uncertainty, contradictions=[*contradictions, *found], apart=apart)
 
 
+@dataclass
+class Starts:
+    """How many models are begun for each that is kept: another one where too few of the matches agree with the first.
+
+    Attributes:
+        enough: the share that is enough: less than at first where two starts that came to the same have shown that no
+            more can be had from these pairs.
+    """
+
+    options: MappingOptions
+    events: Events
+    enough: float = ENOUGH_AGREEMENT
+
+    def is_last(self, model: Reconstruction, best: Reconstruction | None, shares: Sequence[float]) -> bool:
+        """Whether no other start is worth while after a model with the last of these shares of agreement, where
+        ``best`` is the better one of those before."""
+        if shares[-1] >= self.enough:
+            return True
+        is_same = best is not None and np.array_equal(best.is_registered, model.is_registered)
+        if is_same and abs(shares[-1] - max(shares[:-1])) <= SAME_AGREEMENT:
+            self.enough = min(self.enough, max(shares) - SAME_AGREEMENT)
+            self.events.decided(STAGE, f"another start came to the same, {100 * shares[-1]:.1f} % of the matches")
+            return True
+        return False
+
+
 def _grow_models(
-    empty: Reconstruction, mapper_of: Callable[..., Mapper], options: MappingOptions, events: Events,
+    empty: Reconstruction, mapper_of: Callable[..., Mapper], starts: Starts,
     begun: Sequence[Reconstruction] = (), *, is_apart: bool = False,
 ) -> tuple[list[Reconstruction], list[StartReport]]:  # fmt: skip
     """One model after another, each begun from images that no earlier one holds, and the initial pairs tried; before
@@ -223,6 +255,7 @@ def _grow_models(
     """
     models: list[Reconstruction] = []
     initial_reports: list[StartReport] = []
+    options, events = starts.options, starts.events
     seeds = np.ones(len(empty.image_names), bool)
     locked = np.zeros(len(seeds), bool)
     for taken_up in begun:
@@ -237,7 +270,7 @@ def _grow_models(
         if 2 * taken_up.is_registered.sum() > len(seeds):
             locked = locked | taken_up.is_registered
     while seeds.sum() >= 2 and (options.multiple_models or not models):
-        model, tried = _grow_model(empty, seeds, partial(mapper_of, locked=locked), events)
+        model, tried = _grow_model(empty, seeds, partial(mapper_of, locked=locked), starts)
         initial_reports.append(StartReport(pairs=tried))
         if model is None:
             break
@@ -253,16 +286,17 @@ def _grow_models(
 
 
 def _grow_model(
-    empty: Reconstruction, seeds: NDArray[np.bool_], mapper_of: Callable[[Reconstruction], Mapper], events: Events
+    empty: Reconstruction, seeds: NDArray[np.bool_], mapper_of: Callable[[Reconstruction], Mapper], starts: Starts
 ) -> tuple[Reconstruction | None, list[InitialPairReport]]:
     """A model grown from two of the seeds (I,) bool, None if there is no pair to start from, and the pairs tried.
 
     A start may be bad, however good it looks: few points, a small angle, a guess at the focal length. Then the map is
     bent, and verified matches do not meet in it. If too few agree, the model is grown anew from other images, from
-    those it did not reach if there are any. The one that most matches agree with is kept, so that it does not hang on
-    chance which start looked best.
+    those it did not reach if there are any, unless two have come to the same. The one that most matches agree with is
+    kept, so that it does not hang on chance which start looked best.
     """
     best: Reconstruction | None = None
+    shares: list[float] = []
     most, seeds = -math.inf, seeds.copy()
     tried: list[InitialPairReport] = []
     for _ in range(MAX_STARTS):
@@ -277,11 +311,15 @@ def _grow_model(
         agreeing, matches = mapper.agreement()
         # more photographs are worth having only where they agree with what there is
         worth = agreeing - WEIGHT_AGAINST * (matches - agreeing)
+        shares.append(agreeing / matches if matches else 1.0)
+        is_last = starts.is_last(model, best, shares)
         if worth > most:
             best, most = model, worth
-        if agreeing >= ENOUGH_AGREEMENT * matches:
+        if is_last:
             break
-        events.decided(STAGE, f"{agreeing} of {matches} verified matches agree with the model: trying another start")
+        starts.events.decided(
+            STAGE, f"{agreeing} of {matches} verified matches agree with the model: trying another start"
+        )
         seeds[start] = False
         if (seeds & ~model.is_registered).sum() >= 2:
             seeds &= ~model.is_registered
@@ -489,4 +527,4 @@ def compile_kernels() -> None:
         for i in range(3)
     ]
     build_tracks(true_correspondences(scene, min_matches=1), features)
-    rank_next_images(scene.observed, np.arange(3))
+    NextImages(scene.observed).rank(scene.observed, np.arange(3))

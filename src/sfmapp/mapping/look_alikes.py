@@ -66,7 +66,7 @@ def tell_apart(
     before = best = _Attempt(mapped, np.zeros(0, np.int64), _weight(standing), _doubt(standing))
     if before.against == 0:
         return mapped, LookAlikesReport()
-    clearly, last = CLEARLY, before
+    clearly, last, dropped = CLEARLY, before, [before.dropped]
     for _ in range(MAX_ROUNDS):
         is_settled = last.against == 0
         if is_settled:  # all that the map does agree with makes it better, all that it does not only disturbs
@@ -76,8 +76,8 @@ def tell_apart(
             if np.array_equal(refuted, last.dropped) and clearly > 1.0:
                 clearly = 1.0
                 refuted = refuted_pairs(last.mapped.models, standing, correspondences, clearly)
-        if np.array_equal(refuted, last.dropped):
-            break
+        if any(np.array_equal(refuted, earlier) for earlier in dropped):
+            break  # that has been tried, perhaps a round before the last
         events.decided(
             STAGE,
             f"{last.against} verified matches contradict the model: mapping again without {len(refuted)} pairs that "
@@ -86,6 +86,7 @@ def tell_apart(
         again = map_again(correspondences.without(refuted))
         standing = _standing(again, correspondences)
         last = _Attempt(again, refuted, _weight(standing), _doubt(standing))
+        dropped.append(refuted)
         # of several maps that are as doubtful, the least doubtful says nothing: that would be choosing by chance
         is_better = CLEARLY * last.doubt < best.doubt or (is_settled and last.against == 0)
         if is_better and _size(last.mapped) >= _size(best.mapped):

@@ -23,7 +23,7 @@ from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initial_angles, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.keypoint_noise import KeypointNoise, keypoint_noise
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.mapping.register import Registration, rank_next_images, register_image
+from sfmapp.mapping.register import NextImages, Registration, register_image
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, InitialPairReport, Uncertainty
 from sfmapp.mapping.settling import Round, adjust_until_settled, round_options
 from sfmapp.mapping.snapshot import ModelSnapshot
@@ -49,6 +49,9 @@ MIN_NOISE_PX = 0.02
 # The dense inverse of eight unknowns per image takes half a second and 50 MB for this many; beyond it only the blocks
 # that are wanted are made.
 MAX_DENSE_IMAGES = 200
+# What a growing model looks like is told when so large a share of its images is new, as telling takes all observations:
+# at every step up to a hundred images.
+TOLD_SHARE = 0.01
 
 
 @dataclass(kw_only=True)
@@ -83,9 +86,12 @@ class Mapper:
     threads: int = 1
     widening: float = 1.0
     max_error_px: float = field(init=False)
+    _next: NextImages = field(init=False)
+    _untold: list[int] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         self.max_error_px = self.options.max_reprojection_error_px
+        self._next = NextImages(self.reconstruction)
 
     # ------------------------------------------------------------------ start
 
@@ -148,6 +154,8 @@ class Mapper:
                 self.events.advanced(STAGE, len(registered))
             taken_back = self.drop_contradicted_images()
             if not taken_back and (not self._candidates().size or self._size() == self.size_at_global):
+                if self._untold:
+                    self._tell("no other image fits")
                 return
             # a second chance: the adjusted map may hold more points and better poses
             self.adjust_globally()
@@ -159,11 +167,12 @@ class Mapper:
         Images that failed are tried again once they see half as many points more. Images whose position is weak come
         when no other does, one at a time, the surest first.
         """
-        order, scores, counts = rank_next_images(self.reconstruction, self._candidates())
+        order, scores, counts = self._next.rank(self.reconstruction, self._candidates())
+        enough = counts >= self.options.min_pose_inliers
         worth = [
-            (int(i), int(s))
-            for i, s, n in zip(order, scores, counts, strict=True)
-            if n >= max(self.options.min_pose_inliers, 1.5 * self.failed_with.get(int(i), 0))
+            (i, s)
+            for i, s, n in zip(order[enough].tolist(), scores[enough].tolist(), counts[enough].tolist(), strict=True)
+            if n >= 1.5 * self.failed_with.get(i, 0)
         ]
         registered: list[int] = []
         weak: list[Registration] = []
@@ -643,12 +652,10 @@ class Mapper:
     def _covisible_images(self, images: list[int]) -> NDArray[np.int64]:
         """The registered images that share most points with the given ones, as many as the window holds."""
         tracks, used = self.reconstruction.tracks, self.reconstruction.obs_is_inlier
-        is_seen = np.zeros(tracks.num_tracks, bool)
-        for i in images:
-            obs = tracks.observations_of_image(i)
-            is_seen[tracks.obs_track_idx[obs[used[obs]]]] = True
+        own = np.concatenate([tracks.observations_of_image(i) for i in images])
+        obs = tracks.observations_of_tracks(np.unique(tracks.obs_track_idx[own[used[own]]]))
         shared = np.bincount(
-            tracks.obs_image_idx[used & is_seen[tracks.obs_track_idx]], minlength=len(self.reconstruction.image_names)
+            tracks.obs_image_idx[obs[used[obs]]], minlength=len(self.reconstruction.image_names)
         ).astype(np.int64)
         shared[images] = 0
         order = np.argsort(-shared, kind="stable")[: max(1, self.options.local_window - len(images))]
@@ -658,12 +665,22 @@ class Mapper:
         return ", ".join(self.reconstruction.image_names[i] for i in images)
 
     def _decided(self, message: str, images: list[int]) -> None:
+        """Tell of images that have come, and with a good part of new ones what the model looks like."""
+        self._untold += images
+        if len(self._untold) < TOLD_SHARE * self.reconstruction.is_registered.sum():
+            self.events.decided(STAGE, message)
+        else:
+            self._tell(message)
+
+    def _tell(self, message: str) -> None:
+        """Tell what the model looks like, with the images that have come since that was told."""
         summary = self.reconstruction.summary()
         self.events.decided(
             STAGE, f"{message}; {summary.num_points} points, {summary.mean_reprojection_error_px:.2f} px",
             **summary,
             snapshot=ModelSnapshot(
-                tuple(images), summary.num_registered, summary.num_points, summary.mean_reprojection_error_px,
+                tuple(self._untold), summary.num_registered, summary.num_points, summary.mean_reprojection_error_px,
                 self.reconstruction.cam_from_world.copy(), self.reconstruction.point_xyz.astype(np.float32),
             ),
         )  # fmt: skip
+        self._untold = []

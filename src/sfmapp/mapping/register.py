@@ -89,20 +89,35 @@ def visibility_scores(
         counts[n] = count
 
 
-def rank_next_images(
-    reconstruction: Reconstruction, candidates: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Candidates sorted by pyramid score, best first, with their scores and numbers of visible points."""
-    tracks = reconstruction.tracks
-    sizes = np.array([(c.width, c.height) for c in reconstruction.cameras], np.float64)
-    scores = np.zeros(len(candidates), np.int64)
-    counts = np.zeros(len(candidates), np.int64)
-    visibility_scores(
-        candidates, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, tracks.obs_xy, reconstruction.point_xyz,
-        sizes[reconstruction.image_camera_idx], scores, counts,
-    )  # fmt: skip
-    order = np.lexsort((candidates, -scores))
-    return candidates[order], scores[order], counts[order]
+class NextImages:
+    """Ranks unregistered images of one growing model; what each sees is counted again only where it has changed."""
+
+    def __init__(self, reconstruction: Reconstruction) -> None:
+        num_images = len(reconstruction.image_names)
+        self._scores, self._counts = np.zeros(num_images, np.int64), np.zeros(num_images, np.int64)
+        self._was_triangulated = np.zeros(reconstruction.tracks.num_tracks, bool)
+        self._is_stale = np.zeros(num_images, bool)  # nothing is triangulated: all scores are zero
+
+    def rank(
+        self, reconstruction: Reconstruction, candidates: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Candidates sorted by pyramid score, best first, with their scores and numbers of visible points."""
+        tracks, is_triangulated = reconstruction.tracks, reconstruction.is_triangulated
+        changed = np.flatnonzero(is_triangulated != self._was_triangulated)
+        self._was_triangulated = is_triangulated
+        self._is_stale[tracks.obs_image_idx[tracks.observations_of_tracks(changed)]] = True
+        stale = candidates[self._is_stale[candidates]]
+        self._is_stale[stale] = False
+        sizes = np.array([(c.width, c.height) for c in reconstruction.cameras], np.float64)
+        scores, counts = np.zeros(len(stale), np.int64), np.zeros(len(stale), np.int64)
+        visibility_scores(
+            stale, tracks.image_ptr, tracks.image_obs, tracks.obs_track_idx, tracks.obs_xy, reconstruction.point_xyz,
+            sizes[reconstruction.image_camera_idx], scores, counts,
+        )  # fmt: skip
+        self._scores[stale], self._counts[stale] = scores, counts
+        order = np.lexsort((candidates, -self._scores[candidates]))
+        ranked = candidates[order]
+        return ranked, self._scores[ranked], self._counts[ranked]
 
 
 def register_image(

@@ -98,6 +98,13 @@ class Tracks:
         """(K,) positions of the observations of an image."""
         return self.image_obs[self.image_ptr[image_idx] : self.image_ptr[image_idx + 1]]
 
+    def observations_of_tracks(self, track_idx: NDArray[np.integer]) -> NDArray[np.int64]:
+        """(K,) positions of the observations of tracks (N,), those of one after those of another."""
+        begin = self.track_ptr[track_idx]
+        count = self.track_ptr[track_idx + 1] - begin
+        first = np.cumsum(count) - count
+        return np.repeat(begin - first, count) + np.arange(int(count.sum()))
+
 
 def make_tracks(
     num_images: int,
