@@ -109,14 +109,19 @@ def _of_copies(
     for names in duplicates:
         yield _doubt("warning", "copies", names, "the same file", "leave copies out: they add nothing, and cost time")
     tiny = np.array([look.tiny for look in looks]).reshape(len(looks), -1)
-    known = {frozenset((a, b)) for names in duplicates for a in names for b in names}
+    digests = {names[0]: set(names) for names in duplicates}
+    taken: set[int] = set()
     for i in range(len(looks)):
         alike = [int(j) for j in np.flatnonzero(tiny[i + 1 :] @ tiny[i] > _ALIKE) + i + 1]
-        new = [j for j in alike if frozenset((images[i].name, images[j].name)) not in known]
-        names = [images[j].name for j in new if _is_still(looks[i], looks[j], images[i], images[j])]
-        if names:
-            message = f"look the same as {images[i].name}: taken twice from one place, or saved twice"
-            yield _doubt("warning", "copies", names, message, "leave them out: depth needs a step between photographs")
+        still = [j for j in alike if j not in taken and _is_still(looks[i], looks[j], images[i], images[j])]
+        names = [images[j].name for j in (i, *still)]
+        if i in taken or not still or set(names) <= digests.get(names[0], set()):
+            continue
+        taken.update(still)
+        message = "show the same from the same place: taken twice, or saved twice"
+        yield _doubt(
+            "warning", "copies", names, message, "leave all but one out: depth needs a step between photographs"
+        )
 
 
 def _is_still(one: Look, two: Look, record1: ImageRecord, record2: ImageRecord) -> bool:
