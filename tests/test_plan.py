@@ -23,7 +23,8 @@ from sfmapp.images.quality import picture_quality
 from sfmapp.images.small import read_small_gray
 from sfmapp.pipelines.planning import machine
 from sfmapp.pipelines.planning.costs import num_parts
-from sfmapp.pipelines.planning.links import Links
+from sfmapp.pipelines.planning.links import Links, find_links
+from sfmapp.pipelines.planning.look import look_at_all
 from sfmapp.pipelines.planning.trial import choose_images
 from sfmapp.report.model import ReconstructionReport
 from sfmapp.report.plan import WHOLE, Doubt, Interval, PlanCheck, PlanReport
@@ -296,7 +297,7 @@ def test_intervals_read_as_people_say_them() -> None:
 def links_of(num_matches: dict[tuple[int, int], int]) -> Links:
     pairs = np.array(list(num_matches), np.int32).reshape(-1, 2)
     counts = np.array(list(num_matches.values()), np.int64)
-    return Links(pairs, counts, counts, np.zeros(len(pairs), np.int8))
+    return Links(pairs, counts, counts, np.zeros(len(pairs), np.int8), len(pairs))
 
 
 def test_groups_are_what_links_hold_together() -> None:
@@ -356,3 +357,20 @@ def test_the_cache_forgets_what_is_damaged_and_what_is_old(cache: Path, monkeypa
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null/nowhere")
     user_cache.remember("facts", "a", usage(1.0))
     assert user_cache.recall("facts", "a", Usage) is None
+
+
+def test_of_many_pairs_a_part_tells_and_all_of_photographs_that_it_leaves_alone(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image_set = load_images(str(photos), ImageOptions(), Events())[0]
+    features = [look.features for look in look_at_all(image_set.images, threads=2, events=Events())]
+    pairs = np.array([(i, j) for i in range(7) for j in range(i + 1, 7)], np.int32)
+    every = find_links(image_set, features, pairs, seed=0, threads=2, events=Events())
+    assert every.scale == 1.0
+    monkeypatch.setattr("sfmapp.pipelines.planning.links._MOST_COMPARED", 5)
+    for seed in range(3):
+        some = find_links(image_set, features, pairs, seed=seed, threads=1, events=Events())
+        assert 5 <= len(some.pairs) <= 21
+        assert some.num_all == 21
+        assert len({(i, j) for i, j in some.pairs.tolist()}) == len(some.pairs)
+        assert some.groups(7) == every.groups(7)

@@ -32,6 +32,8 @@ _OBS_PER_IMAGE = 3300.0
 _MAPPING_BELOW, _MAPPING_ABOVE = 0.35, 1.2
 # Where photographs fall into parts that share little, models are grown apart and joined.
 _PER_PART = 0.8
+# Where photographs say where they were taken, models are adjusted to that and held against it.
+_WITH_POSITIONS = 2.2
 # Links with fewer matches than this share of a photograph's best one hold parts together loosely.
 _LOOSE = 0.1
 # Of a track of verified matches: shares of its observations that are kept
@@ -56,7 +58,6 @@ class Given:
 
     Attributes:
         images: of the run.
-        num_selected: pairs that it will compare.
         select_cpu_s: that choosing them took, with features of small versions.
     """
 
@@ -65,7 +66,6 @@ class Given:
     machine: Machine
     links: Links
     trial: Trial
-    num_selected: int
     select_cpu_s: float
 
 
@@ -139,18 +139,19 @@ def _num_overlapping(given: Given) -> Interval:
     share = (sum(seen) + 0.2) / (len(seen) + 1.0)
     spread = _SIGMAS * math.sqrt(share * (1.0 - share) / (len(seen) + 1.0)) + 0.5 / (len(seen) + 1.0)
     high = linked + others * min(1.0, share + spread)
-    return Interval(0.85 * linked, linked + others * share, high)
+    scale = given.links.scale
+    return Interval(0.85 * linked * scale, (linked + others * share) * scale, high * scale)
 
 
 def _num_matches(given: Given) -> Interval:
     """Verified matches of all pairs: those of small versions, times what whole photographs have more of them."""
-    in_small = int(given.links.num_matches.sum())
+    in_small = given.links.scale * float(given.links.num_matches.sum())
     pairs = _tried(given)
     small = {(int(i), int(j)): int(num) for (i, j), num in zip(given.links.pairs, given.links.num_matches, strict=True)}
     matched = np.array([(small.get(pair.images, 0), pair.num_matches) for pair, _ in pairs], np.float64).reshape(-1, 2)
     total_small, total = matched.sum(axis=0)
     if total_small <= 0.0:
-        return Interval(0.0, total, max(total, 100.0 * given.num_selected))
+        return Interval(0.0, total, max(total, 100.0 * given.links.num_all))
     ratio = total / total_small
     spread = _SIGMAS * float(np.abs(matched[:, 1] - ratio * matched[:, 0]).sum()) / max(total, 1.0)
     error = min(0.9, max(0.15, spread / math.sqrt(max(1, len(matched)))))
@@ -159,7 +160,7 @@ def _num_matches(given: Given) -> Interval:
 
 def _num_observations(given: Given, overlapping: Interval, matches: Interval, num_features: Interval) -> Interval:
     """Observations of points: a track over L images has L of them and up to L (L - 1) / 2 matches."""
-    length = 2.0 + 0.2 * max(0.0, _neighbors(given.links, len(given.images)) - 1.0)
+    length = 2.0 + 0.2 * max(0.0, given.links.scale * _neighbors(given.links, len(given.images)) - 1.0)
     likely = min(_KEPT * 2.0 * matches.likely / (length - 1.0), 0.8 * num_features.likely)
     return Interval.about(likely, 0.45, 0.6)
 
@@ -214,7 +215,7 @@ def _pairs_cpu(given: Given) -> Interval:
 
 
 def _matching_cpu(given: Given) -> Interval:
-    scale = given.num_selected / max(1, len(given.links.pairs))
+    scale = given.links.scale
     parts = []
     every = [pair.cpu_s for pair, _ in _tried(given)]
     for wanted in (True, False):
@@ -233,6 +234,8 @@ def _mapping_cpu(given: Given, observations: Interval) -> Interval:
     unit = machine.usage["mapping"].cpu_s / (_OBS_PER_IMAGE * machine.num_images + machine.num_observations)
     parts = num_parts(given.links, num_images)
     likely = unit * (_OBS_PER_IMAGE * num_images + observations.likely) * (1.0 + _PER_PART * (parts - 1))
+    if 2 * sum(image.position is not None for image in given.images) > num_images:
+        likely *= _WITH_POSITIONS
     return Interval.about(likely, _MAPPING_BELOW, _MAPPING_ABOVE)
 
 
@@ -277,7 +280,7 @@ def _memory(given: Given, num_features: Interval, matches: Interval, observation
             break
         at_once += need
     kept = num_features.likely * _FEATURE_BYTES
-    found = matches.likely * _MATCH_BYTES + given.num_selected * _PAIR_BYTES
+    found = matches.likely * _MATCH_BYTES + given.links.num_all * _PAIR_BYTES
     scratch = at_once  # the workers' memory is not given back to the system
     mapping = observations.likely * _MAPPING_OBS_BYTES + matches.likely * _MAPPING_MATCH_BYTES
     peaks = {
@@ -293,7 +296,7 @@ def _memory(given: Given, num_features: Interval, matches: Interval, observation
 def _disk(given: Given, num_features: Interval, matches: Interval, observations: Interval) -> Interval:
     """MB of the output: database, model, recording."""
     database = num_features.likely * _STORED_FEATURE_BYTES + matches.likely * _MATCH_BYTES
-    database += given.num_selected * _PAIR_BYTES
+    database += given.links.num_all * _PAIR_BYTES
     points = observations.likely / 3.0
     model = num_features.likely * _MODEL_FEATURE_BYTES + observations.likely * _OBS_BYTES + points * _POINT_BYTES
     shown = sum(min(1.0, image.width * image.height / _SCREEN_PX) for image in given.images)

@@ -102,7 +102,7 @@ def _worked(
     most = _num_tried(image_set, machine)
     trial = try_images(image_set, choose_images(links, len(looks), most, wanted), options, events)
     links = links.with_found(pair.images for pair in trial.pairs if pair.num_matches)
-    return Given(image_set.images, options, machine, links, trial, len(pairs), select_cpu_s), selected
+    return Given(image_set.images, options, machine, links, trial, select_cpu_s), selected
 
 
 def _num_tried(image_set: ImageSet, machine: Machine) -> int:
@@ -199,7 +199,7 @@ def _report(
             for one in found.cameras
         ],
         groups=[len(group) for group in given.links.groups(len(images))],
-        num_pairs=given.num_selected,
+        num_pairs=given.links.num_all,
         num_overlapping=told.num_overlapping,
         pairs_reason=selected.reason,
         num_features=told.num_features,
