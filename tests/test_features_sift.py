@@ -337,6 +337,16 @@ def test_descriptors_are_those_of_a_plain_histogram() -> None:
         assert np.abs(mine - expected).max() < 1.0  # half of it is rounding, the rest the angles to 1e-5
 
 
+def test_samples_on_the_edge_of_the_cells_stay_in_them() -> None:
+    """A place that rounds to the far edge counts for the last cell, and nothing behind the memory is written to."""
+    room = np.full(descriptor.ROOM + 256, 123.0, np.float32)
+    level = scale_space.empty_level((60, 60))
+    level[:] = np.random.default_rng(2).uniform(0.0, 255.0, level.shape)
+    # cells of four pixels: what lies ten pixels away less a bit is two and a half of them from the middle, less a bit
+    descriptor.describe(level, 9.0 + 2.0**-20, 9.0 + 2.0**-20, 4.0 / 3.0, 0.0, room, np.empty(128, np.uint8))
+    np.testing.assert_array_equal(room[descriptor.ROOM :], 123.0)
+
+
 def test_extrema_are_those_of_a_plain_search() -> None:
     """All 26 neighbours, in numpy, at widths around whole vectors and whole tiles."""
     rng = np.random.default_rng(0)

@@ -273,7 +273,8 @@ def _share_out(samples: Pointer, start: Any, num: int) -> None:
     for n in range(num):
         u, v, weight = samples[_U + n], samples[_V + n], samples[_GX + n]
         turn = start - samples[_GY + n] * to_eighths
-        iu, iv, it = np.int32(u), np.int32(v), np.int32(turn)
+        # what is less than five before it is rounded may be five afterwards
+        iu, iv, it = min(np.int32(u), np.int32(4)), min(np.int32(v), np.int32(4)), np.int32(turn)
         below = weight * (v - np.float32(iv))
         samples[_U + n] = u - np.float32(iu)
         samples[_V + n] = turn - np.float32(it)
