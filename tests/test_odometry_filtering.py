@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from inertial_flights import ACCEL_BIAS, GRAVITY, GYRO_BIAS, IMU_FROM_CAM, Flight
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.images.imu_stream import ImuStream
+from sfmapp.images.imu_stream import KEPT_S, ImuStream
 from sfmapp.images.sequence import Imu
+from sfmapp.odometry.inertial import filtered_rows, filtering
 from sfmapp.odometry.inertial.filter_state import INDEPENDENT, InertialSensor, Shared
 from sfmapp.odometry.inertial.filtering import (
     FilteredPose,
     FilteredTrajectory,
     InertialFilter,
+    autocovariance,
     consistency,
+    correlation_time,
     filter_trajectory,
 )
 from sfmapp.odometry.inertial.integration import ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA
@@ -29,7 +35,7 @@ from sfmapp.odometry.report import FilterReport
 from sfmapp.odometry.residual_memory import Correlation, ResidualMemory
 from sfmapp.odometry.result import FrameState
 from sfmapp.odometry.snapshot import FrameSnapshot
-from sfmapp.pipelines.odometry.filtering import COLUMNS, LiveFilter, SharedErrors, filtered_csv
+from sfmapp.pipelines.odometry.filtering import COLUMNS, LiveFilter, SharedErrors, write_filtered_csv
 from sfmapp.report.model import FramesReport
 from sfmapp.report.odometry_document import FrameTable, make_checks
 from test_odometry_smoothing import perturbed, tangent
@@ -75,11 +81,14 @@ CASES = [Case(seed) for seed in range(8)]
 def test_with_a_sensor_innovations_and_errors_are_as_stated() -> None:
     found = [case.filtered(case.sensor) for case in CASES]
     # of the first velocity less is said than is known
-    told = consistency(np.concatenate([f.nis[3:] for f in found]))
+    told = consistency(np.concatenate([f.nis[3:] for f in found]), np.concatenate([f.innovation[3:] for f in found]))
     assert told is not None
     assert told.num_innovations == len(CASES) * (len(CASES[0].times) - 3)
     # independent from frame to frame: within the 95 % band, two-sided
     assert told.mean_low < told.mean < told.mean_high
+    assert told.correlation is not None
+    assert abs(told.correlation) < told.max_correlation
+    assert told.num_independent > 0.8 * told.num_innovations
     assert told.share_inside == pytest.approx(0.95, abs=1.96 * np.sqrt(0.95 * 0.05 / told.num_innovations))
     # errors of neighbours are alike: poses two seconds apart count as draws
     errors = []
@@ -179,6 +188,56 @@ def test_silence_of_the_sensor_and_long_gaps_begin_anew() -> None:
         filter_trajectory(np.zeros(len(poses)), poses, case.covariance, case.sensor)
 
 
+def test_a_sensor_that_was_taken_for_another_is_found_out() -> None:
+    """Poses that turn for three seconds while the camera does not look like a bias of the gyroscope, of which the
+    filter is sure by then."""
+    for case in CASES[1:3]:
+        turn = np.outer(np.minimum(case.times, 3.0), [0.0, 0.0, 0.03])
+        wrong = rigid3.compose(case.poses, rigid3.from_matrix(rigid3.exp_so3(turn), np.zeros((len(turn), 3))))
+        f = filter_trajectory(case.times, wrong, case.covariance, case.sensor)
+        assert f.is_rejected.sum() > 5
+        assert not f.is_rejected[140:].any()
+        told = consistency(f.nis[140:])
+        assert told is not None
+        assert told.mean_low < told.mean < told.mean_high
+        bias = (case.sensor.imu.gyro - case.flight.gyro(case.sensor.imu.timestamps_s)).mean(0)
+        assert np.abs(f.gyro_bias - bias).max() < 0.003
+
+
+def test_hours_of_rows_are_in_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = CASES[0]
+    kept = case.filtered(case.sensor)
+    monkeypatch.setattr(filtered_rows, "_WAITING", 1000)
+    found = case.filtered(case.sensor)
+    assert isinstance(found.covariance.base, np.memmap)
+    for name in ("timestamps_s", "cam_from_world", "covariance", "since_pose_s", "is_bridged", "frame_row", "nis"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(kept, name))
+    monkeypatch.setattr(filtering, "_AT_ONCE", 100)
+    np.testing.assert_allclose(found.position_sigma, kept.position_sigma, rtol=1e-12)
+
+
+def test_a_stream_keeps_the_last_minute() -> None:
+    imu = CASES[0].sensor.imu
+    stream = ImuStream(replace(imu, timestamps_s=np.zeros(0), gyro=np.zeros((0, 3)), accel=np.zeros((0, 3))))
+    for k in range(2000):
+        stream.push(0.1 * k, np.zeros(3), np.full(3, k))
+    kept = stream.recorded()
+    assert kept.timestamps_s[0] == pytest.approx(199.9 - KEPT_S)
+    assert len(kept.timestamps_s) == 10 * KEPT_S + 1
+    assert [sample[4] for sample in stream.after(199.65)] == [1997.0, 1998.0, 1999.0]
+    assert stream.after(199.9) == []
+
+
+def test_how_long_a_series_lasts() -> None:
+    """Steps of an autoregression that keeps 0.6 of its last value are worth a quarter of independent ones."""
+    rng = np.random.default_rng(2)
+    values = lfilter([1.0], [1.0, -0.6], rng.normal(size=20_000))
+    assert correlation_time(autocovariance(values)) == pytest.approx(1.6 / 0.4, rel=0.1)
+    assert correlation_time(autocovariance(rng.normal(size=20_000))) == pytest.approx(1.0, abs=0.1)
+    assert correlation_time(autocovariance(np.ones(5))) == 1.0
+    np.testing.assert_allclose(autocovariance(np.array([1.0, 2.0, 3.0, 6.0]))[:2], [3.5, 0.5])
+
+
 def noisier_sensor(case: Case) -> Imu:
     """Thirty times as noisy as it says."""
     noisy, said = case.flight.imu(3, DURATION_S, noise=30.0, rate_hz=RATE_HZ), case.sensor.imu
@@ -249,24 +308,29 @@ def test_the_mounting_counts() -> None:
 
 def drifting(case: Case, seed: int, shared: Shared) -> np.ndarray:
     """Poses whose errors are partly new in each frame, and partly walk on with the map: a place that was seen with an
-    error stays where it was put. What walks has a rate that lasts for 2 / walk frames."""
+    error stays where it was put. What walks has a rate that lasts for 2 / walk frames, and goes by half of what a pose
+    is less sure than the one before it as well."""
     rng = np.random.default_rng([seed, 77])
     measured, kept = read_measured(case.times, case.truth, case.covariance), 1.0 - 0.5 * shared.walk
-    poses, turn, shift, rate = [], np.eye(3), np.zeros(3), np.zeros(6)
+    poses, turn, shift, rate, last = [], np.eye(3), np.zeros(3), np.zeros(6), np.zeros((6, 6))
     for k, (center, rotation, noise) in enumerate(
         zip(measured.position, measured.rotation, measured.noise, strict=True)
     ):
         to_map = np.eye(6)
         to_map[3:, 3:] = turn @ rotation
-        new_rate, walk = (np.linalg.cholesky(to_map @ noise @ to_map.T) @ rng.normal(size=6) for _ in range(2))
+        now = to_map @ noise @ to_map.T
+        new_rate, walk = (np.linalg.cholesky(now) @ rng.normal(size=6) for _ in range(2))
         if k:
-            step = rate + np.sqrt(shared.walk) * walk
+            size, axes = eigh(now - last, now)
+            grown = now @ axes @ (np.sqrt(np.maximum(size, 0.0)) * rng.normal(size=6))
+            step = rate + np.sqrt(shared.walk) * walk + np.sqrt(0.5 * (1.0 - shared.white)) * grown
             seen = turn @ center
             turned = rigid3.exp_so3(step[3:])
             turn, shift = turned @ turn, shift + seen + step[:3] - turned @ seen
             rate = kept * rate + np.sqrt(1.0 - kept**2) * shared.walk * new_rate
         else:
             rate = shared.walk * new_rate
+        last = now
         poses.append(rigid3.inverse(rigid3.from_matrix(turn @ rotation, turn @ center + shift)))
     white = np.sqrt(shared.white) * np.linalg.cholesky(case.covariance)
     return perturbed(np.array(poses), np.einsum("nij,nj->ni", white, rng.normal(size=(len(poses), 6))))
@@ -440,7 +504,7 @@ def test_samples_that_are_pushed_become_poses_at_once() -> None:
 
 
 @pytest.mark.parametrize("unit_m", [None, 2.0])
-def test_a_run_finds_gravity_scale_and_clock_by_itself(unit_m: float | None) -> None:
+def test_a_run_finds_gravity_scale_and_clock_by_itself(unit_m: float | None, tmp_path: Path) -> None:
     for case in CASES[:3]:
         late = replace(case.sensor.imu, timestamps_s=case.sensor.imu.timestamps_s + LATE_S)
         found, report = lived(case, late, unit_m=unit_m)
@@ -454,7 +518,8 @@ def test_a_run_finds_gravity_scale_and_clock_by_itself(unit_m: float | None) -> 
         ways = [np.linalg.norm(np.diff(rigid3.center(poses), axis=0), axis=1).sum() for poses in (
             found.cam_from_world[found.frame_row[-100:]], case.truth[-100:])]  # fmt: skip
         assert ways[0] == pytest.approx(ways[1], rel=0.02)
-        lines = filtered_csv(found).splitlines()
+        write_filtered_csv(tmp_path / "filtered.csv", found)
+        lines = (tmp_path / "filtered.csv").read_text().splitlines()
         assert lines[0] == ",".join(COLUMNS)
         assert len(lines) == len(found.timestamps_s) + 1
 

@@ -18,6 +18,7 @@ from sfmapp.formats.atomic import replaced_file
 from sfmapp.geometry import rigid3
 
 _HEAD = "# timestamp tx ty tz qx qy qz qw\n"
+_AT_ONCE = 10_000
 
 
 def write_tum(path: str | Path, timestamps_s: ArrayLike, cam_from_world: NDArray[np.float64]) -> None:
@@ -27,9 +28,12 @@ def write_tum(path: str | Path, timestamps_s: ArrayLike, cam_from_world: NDArray
         timestamps_s: (N,) seconds.
         cam_from_world: (N, 7), NaN where unregistered: such poses are left out.
     """
-    lines = _lines(np.asarray(timestamps_s, np.float64), cam_from_world)
-    with replaced_file(Path(path)) as beside:
-        beside.write_text(_HEAD + "".join(lines), encoding="utf-8")
+    times = np.asarray(timestamps_s, np.float64)
+    with replaced_file(Path(path)) as beside, beside.open("w", encoding="utf-8") as file:
+        file.write(_HEAD)
+        for first in range(0, len(times), _AT_ONCE):  # hours of a sensor's samples would be a gigabyte of text
+            some = slice(first, first + _AT_ONCE)
+            file.writelines(_lines(times[some], cam_from_world[some]))
 
 
 class GrowingTum:

@@ -1,10 +1,11 @@
-"""Inertial measurements that a program pushes as they come: checked, kept, and told to whoever listens."""
+"""Inertial measurements that a program pushes as they come: checked, kept for a while, and told to whoever listens."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
-from array import array
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -16,12 +17,13 @@ from sfmapp.images.sequence import Imu
 
 Array = NDArray[np.float64]
 
-# Numbers of a sample: time, rates and forces.
-_SIZE = 7
+# A frame that is tracked has been waiting for less than that, and what is begun with is older by seconds.
+KEPT_S = 60.0
 
 
 class ImuStream:
-    """Measurements one by one, from any thread; each is told to the listeners in the thread that pushes.
+    """Measurements one by one, from any thread; each is told to the listeners in the thread that pushes. Those of the
+    last minute are kept.
 
     Args:
         sensor: how it is mounted and how noisy it is. Measurements that it has are the first ones.
@@ -42,7 +44,7 @@ class ImuStream:
             )
         self._sensor = sensor
         self._lock = threading.Lock()
-        self._numbers = array("d")
+        self._kept = deque[Array]()
         self._last_s = -math.inf
         self._listeners: list[Callable[[], None]] = []
         measured = zip(sensor.timestamps_s, sensor.gyro, sensor.accel, strict=True)
@@ -60,8 +62,10 @@ class ImuStream:
         with self._lock:
             if not self._last_s < numbers[0] < math.inf:
                 raise InputError(f"IMU: expected a time after {self._last_s:g} s, found {numbers[0]:g}")
-            self._numbers.extend(numbers)
+            self._kept.append(np.array(numbers))
             self._last_s = numbers[0]
+            while self._kept[0][0] < self._last_s - KEPT_S:
+                self._kept.popleft()
         for listener in self._listeners:
             listener()
 
@@ -69,14 +73,14 @@ class ImuStream:
         """Have a function called after each sample."""
         self._listeners.append(listener)
 
-    def sample(self, idx: int) -> Array | None:
-        """(7,) time, rates and forces of the sample of a number; None where there is none yet."""
+    def after(self, timestamp_s: float) -> list[Array]:
+        """Time, rates and forces (7,) of each sample that is kept and later than a moment, in order."""
         with self._lock:
-            start = _SIZE * idx
-            return np.array(self._numbers[start : start + _SIZE]) if start < len(self._numbers) else None
+            found = list(itertools.takewhile(lambda sample: sample[0] > timestamp_s, reversed(self._kept)))
+        return found[::-1]
 
     def recorded(self) -> Imu:
-        """All that came so far."""
+        """All that are kept."""
         with self._lock:
-            rows = np.array(self._numbers).reshape(-1, _SIZE)
+            rows = np.array(self._kept).reshape(-1, 7)
         return replace(self._sensor, timestamps_s=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:], elapsed_s=None)

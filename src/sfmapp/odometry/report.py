@@ -183,6 +183,10 @@ class FilterConsistency(Report):
         mean: of the normalised innovations squared, a degree of freedom: 1 where all is as modelled, and within
             mean_low to mean_high in 95 % of runs then.
         share_inside: of them inside the 95 % interval of one, both sides.
+        num_independent: how many independent ones they are worth, as their squares are correlated in time;
+            correlated_low, correlated_high: within which the mean is in 95 % of runs, of so many.
+        correlation: of innovations with those of the frame before; white ones have less than max_correlation, either
+            way, in 95 % of runs. Absent where only their squares are known.
     """
 
     num_innovations: int
@@ -190,6 +194,11 @@ class FilterConsistency(Report):
     mean_low: float
     mean_high: float
     share_inside: float
+    num_independent: float
+    correlated_low: float
+    correlated_high: float
+    max_correlation: float
+    correlation: float | None = None
 
 
 class RejectedPose(Report):

@@ -337,9 +337,16 @@ def _filter(found: FilterReport | None) -> str:
     )
     if told := found.consistency:
         text += (
-            f"Measured poses were {told.mean:.2f} of the expected squares from where they were expected "
-            f"({told.mean_low:.2f} to {told.mean_high:.2f} in 95 % of runs where all is as modelled)."
+            f"Squares of what the {told.num_innovations} measured poses said beyond the prediction are "
+            f"{told.mean:.2f} of what is expected; independent ones would be {told.mean_low:.2f} to "
+            f"{told.mean_high:.2f} in 95 % of runs, and these, which are worth {told.num_independent:.0f} independent "
+            f"ones, {told.correlated_low:.2f} to {told.correlated_high:.2f}. "
         )
+        if told.correlation is not None:
+            text += (
+                f"Those of neighbouring frames are correlated by {told.correlation:.2f}; independent ones by less than "
+                f"{told.max_correlation:.2f}."
+            )
     rows = [
         [("", f"{gap.first_s:.2f}"), ("", f"{gap.last_s:.2f}"), ("", f"{gap.position_sigma:.3g}"),
          ("", f"{gap.rotation_sigma_deg:.2f}")] for gap in found.gaps[:MAX_GAPS]

@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,11 +26,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.inertial.filter_state import INDEPENDENT, FilterState, InertialSensor, Shared
+from sfmapp.odometry.inertial.filtered_rows import FilteredRow, FilteredRows, as_given
 from sfmapp.odometry.inertial.gyroscope import MAX_SILENCE_S
 from sfmapp.odometry.inertial.smoothing import (
     SmoothingOptions,
     compile_kernels,
-    error_from_tangent,
     read_measured,
     smooth_trajectory,
     unknown_rates,
@@ -43,6 +44,8 @@ Bools = NDArray[np.bool_]
 # Innovations of so many frames are held against what they should be, of no fewer than so many; what one in a thousand
 # of good ones goes beyond is too much: the quantile of a normal distribution.
 _WINDOW, _LEAST_WINDOW, _QUANTILE = 40, 20, 3.09
+# Rows that are looked at together, of what may be hours.
+_AT_ONCE = 10_000
 # Frames further apart than so many times their usual distance have lost some between them.
 _DROPPED = 1.5
 LIVE = SmoothingOptions(max_gap_s=5.0, is_causal=True)
@@ -51,7 +54,8 @@ LIVE = SmoothingOptions(max_gap_s=5.0, is_causal=True)
 
 @dataclass(frozen=True)
 class FilteredTrajectory:
-    """Poses at the times of the sensor's samples and of the frames.
+    """Poses at the times of the sensor's samples and of the frames. Of a long run the arrays of rows are read-only
+    views of a file.
 
     Attributes:
         timestamps_s: (N,) ascending.
@@ -60,8 +64,9 @@ class FilteredTrajectory:
         since_pose_s: (N,) seconds since the last pose that was used.
         is_bridged: (N,) bool: a frame since then, or this one, brought no pose that was used.
         frame_row: (F,) int64 position of each frame in these, -1 of those that nothing reaches.
-        nis: (F,) normalised innovations squared, 6 in the mean where all is as modelled; NaN where there was nothing to
-            compare.
+        innovation: (F, 6) what measured poses said beyond the prediction, each of the six a standard deviation large
+            and independent where all is as modelled; NaN where there was nothing to compare, and without a sensor.
+        nis: (F,) normalised innovations squared, 6 in the mean where all is as modelled; NaN as above.
         is_rejected: (F,) bool: the pose disagreed with the motion and was not used.
         prediction: ``imu`` or ``constant velocity``.
         gyro_bias, accel_bias: (3,) in the end; zeros without a sensor.
@@ -76,6 +81,7 @@ class FilteredTrajectory:
     since_pose_s: Array
     is_bridged: Bools
     frame_row: Ints
+    innovation: Array
     nis: Array
     is_rejected: Bools
     prediction: str
@@ -87,8 +93,11 @@ class FilteredTrajectory:
     @property
     def position_sigma(self) -> Array:
         """(N,) standard deviation of the camera's centre in the world, the root of the sum over the axes."""
-        of_center = rigid3.center_covariance(self.cam_from_world, self.covariance)
-        sigma: Array = np.sqrt(np.trace(of_center, axis1=1, axis2=2))
+        sigma = np.empty(len(self.timestamps_s))
+        for first in range(0, len(sigma), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            of_center = rigid3.center_covariance(self.cam_from_world[some], self.covariance[some])
+            sigma[some] = np.sqrt(np.trace(of_center, axis1=1, axis2=2))
         return sigma
 
     @property
@@ -145,19 +154,64 @@ def filter_trajectory(
     return found.result()
 
 
-def consistency(nis: Array) -> FilterConsistency | None:
-    """Hold normalised innovations squared (F,) of six degrees of freedom against chi-squared; None without any."""
+def consistency(nis: Array, innovation: Array | None = None) -> FilterConsistency | None:
+    """Hold innovations of six degrees of freedom against what is stated of them; None without any.
+
+    Their mean square has a chi-squared distribution where they are independent from frame to frame, which is tested by
+    how they are correlated with those of the frame before (Bar-Shalom, Li and Kirubarajan, "Estimation with
+    applications to tracking and navigation", 2001, section 5.4.2). Of a filter whose covariances are right in size, but
+    which does not model all that lasts, as many are independent as the correlations of NIS leave.
+
+    Args:
+        nis: (F,) normalised innovations squared, NaN of frames without.
+        innovation: (F, 6) as of :class:`FilteredTrajectory`; None where only their squares are known.
+    """
     from scipy.stats import chi2  # heavy to load
 
     known = nis[np.isfinite(nis)]
     if not len(known):
         return None
     low, high = chi2.ppf([0.025, 0.975], 6.0)
-    mean_low, mean_high = chi2.ppf([0.025, 0.975], 6.0 * len(known)) / (6.0 * len(known))
+    num_independent = len(known) / correlation_time(autocovariance(known))
+    bounds = [chi2.ppf([0.025, 0.975], 6.0 * num) / (6.0 * num) for num in (len(known), num_independent)]
+    correlation = None if innovation is None else neighbour_correlation(innovation)
     return FilterConsistency(
-        num_innovations=len(known), mean=float(known.mean() / 6.0), mean_low=float(mean_low),
-        mean_high=float(mean_high), share_inside=float(np.mean((known >= low) & (known <= high))),
+        num_innovations=len(known), mean=float(known.mean() / 6.0),
+        mean_low=float(bounds[0][0]), mean_high=float(bounds[0][1]),
+        share_inside=float(np.mean((known >= low) & (known <= high))),
+        num_independent=num_independent, correlated_low=float(bounds[1][0]), correlated_high=float(bounds[1][1]),
+        correlation=correlation, max_correlation=float(1.96 / np.sqrt(6.0 * len(known))),
     )  # fmt: skip
+
+
+def autocovariance(values: Array) -> Array:
+    """(N,) of a series about its own mean, at 0 to N - 1 steps: sums over N, which are not larger than the truth."""
+    from scipy.signal import correlate
+
+    apart = values - values.mean()
+    found: Array = correlate(apart, apart, "full")[len(apart) - 1 :] / len(apart)
+    return found
+
+
+def correlation_time(autocovariance: Array) -> float:
+    """How many steps a value of a series (N,) lasts, 1 or more: a mean of n is as good as one of n over this.
+
+    The initial monotone sequence of Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992, section 3.3:
+    sums over two neighbouring steps, as long as they are above zero, none larger than the one before.
+    """
+    if not autocovariance[0] > 0.0:
+        return 1.0
+    even = len(autocovariance) // 2 * 2
+    pairs = np.minimum.accumulate(autocovariance[:even].reshape(-1, 2).sum(1) / autocovariance[0])
+    return max(1.0, 2.0 * float(pairs[pairs > 0.0].sum()) - 1.0)
+
+
+def neighbour_correlation(innovation: Array) -> float | None:
+    """Of innovations (F, 6) with those of the frame before, by their scalar products; None without neighbours."""
+    one, other = innovation[:-1], innovation[1:]
+    both = np.isfinite(one[:, 0]) & np.isfinite(other[:, 0])
+    size = float(np.sqrt((one[both] ** 2).sum() * (other[both] ** 2).sum()))
+    return float((one[both] * other[both]).sum()) / size if size > 0.0 else None
 
 
 def _at_constant_velocity(
@@ -175,29 +229,9 @@ def _at_constant_velocity(
     since = times[rows] - times[np.maximum.accumulate(used)] if len(rows) else np.zeros(0)
     return FilteredTrajectory(
         times[rows], found.cam_from_world[rows], found.covariance[rows], since, found.is_predicted[rows], frame_row,
-        found.nis, found.is_rejected, "constant velocity", np.zeros(3), np.zeros(3),
+        np.full((len(times), 6), np.nan), found.nis, found.is_rejected, "constant velocity", np.zeros(3), np.zeros(3),
         np.full(len(rows), spent / max(len(rows), 1)), np.ones(len(rows)),
     )  # fmt: skip
-
-
-class _Row(NamedTuple):
-    """A pose that was found: rotation world_from_cam (3, 3), centre (3,), and their covariance (6, 6), centre first."""
-
-    timestamp_s: float
-    rotation: Array
-    center: Array
-    covariance: Array
-    since_pose_s: float
-    is_bridged: bool
-    latency_s: float
-    widening: float
-
-    def as_given(self) -> FilteredPose:
-        """The same in the order of the error of poses."""
-        change = np.linalg.inv(error_from_tangent(self.rotation[None])[0])
-        pose = rigid3.inverse(rigid3.from_matrix(self.rotation, self.center))
-        covariance = change @ self.covariance @ change.T
-        return FilteredPose(self.timestamp_s, pose, covariance, self.since_pose_s, self.is_bridged)
 
 
 class _Sample(NamedTuple):
@@ -231,8 +265,9 @@ class InertialFilter:
         self._anchor_s = self._head_s = self._used_s = -math.inf
         self._samples: list[_Sample] = []  # from the last one before the anchor on
         self._in_a_row, self._is_waiting, self._interval_s = 0, False, math.inf
-        self._rows, self._recent = list[_Row](), deque[float](maxlen=_WINDOW)
-        self._nis, self._is_rejected, self._frame_s = list[float](), list[bool](), list[float]()
+        self._since_forgotten = _WINDOW  # frames since what was predicted was forgotten
+        self._rows, self._recent = FilteredRows(), deque[float](maxlen=_WINDOW)
+        self._innovation, self._is_rejected, self._frame_row = array("d"), array("b"), array("q")  # of each frame
 
     def add_sample(self, timestamp_s: float, gyro: Array, accel: Array) -> None:
         """Move on to a sample: rad/s and m/s^2. One that is no later than the last is left out."""
@@ -248,16 +283,17 @@ class InertialFilter:
             self._head.predict(self._step(self._head_s, timestamp_s))
             self._head_s = timestamp_s
             is_late = timestamp_s - self._used_s > _DROPPED * self._interval_s
-            self._note(self._head, timestamp_s, self._is_waiting or is_late, begin)
+            row = self._note(self._head, timestamp_s, self._is_waiting or is_late, begin)
             if self.on_pose is not None:
-                self.on_pose(self._rows[-1].as_given())
+                (pose,), (covariance,) = as_given([row])
+                self.on_pose(FilteredPose(timestamp_s, pose, covariance, row.since_pose_s, row.is_bridged))
         elif self._head is None:
             del self._samples[:-2]
 
     def add_frame(
         self, timestamp_s: float, pose: tuple[Array, Array, Array] | None, shared: Shared = INDEPENDENT,
         map_moved: Array = similarity.IDENTITY,
-    ) -> None:  # fmt: skip
+    ) -> float | None:  # fmt: skip
         """Correct by a frame, later than those before it.
 
         Args:
@@ -265,27 +301,35 @@ class InertialFilter:
             shared: how far its error is that of the frames before.
             map_moved: (8,) a place x of the map was at map_moved(x) in the frame before: what an adjustment or a loop
                 has changed is no motion, and the sensor knew nothing of it.
+
+        Returns:
+            The normalised innovation squared of a pose that was not believed; None otherwise.
         """
         begin = time.perf_counter()
-        self._frame_s.append(timestamp_s)
-        self._nis.append(math.nan)
+        self._frame_row.append(-1)
+        self._innovation.extend([math.nan] * 6)
         self._is_rejected.append(False)
         if self._anchor is not None and not self._reaches(timestamp_s):
             self._stop()
         if self._anchor is None:
             if pose is not None:
                 self._begin_at(timestamp_s, pose, shared, begin)
-            return
+            return None
         at_frame = self._anchor.copied()
         self._go_through(at_frame, self._anchor_s, timestamp_s)
         at_frame.move_map(map_moved)
         is_used = pose is not None and self._correct(at_frame, pose, shared)
+        if self._anchor is None:
+            assert pose is not None
+            self._begin_at(timestamp_s, pose, shared, begin)
+            return None
         if is_used:
             self._interval_s = timestamp_s - self._anchor_s
             self._used_s = timestamp_s
         self._is_waiting = not is_used
         self._hold(at_frame, timestamp_s)
-        self._note(at_frame, timestamp_s, not is_used, begin)
+        self._note_frame(at_frame, timestamp_s, not is_used, begin)
+        return sum(value**2 for value in self._innovation[-6:]) if self._is_rejected[-1] else None
 
     @property
     def start_sigmas(self) -> tuple[float, float]:
@@ -300,30 +344,20 @@ class InertialFilter:
         begin = time.perf_counter()
         state, now = self._anchor, self._anchor_s
         state.take_map_for_world()
-        for kept in (self._nis, self._is_rejected, self._frame_s):
-            del kept[:-1]
-        self._rows.clear()
+        del self._innovation[:-6], self._is_rejected[:-1], self._frame_row[:-1]
+        self._rows = FilteredRows()
         self._hold(state, now)
-        self._note(state, now, self._is_waiting, begin)
+        self._note_frame(state, now, self._is_waiting, begin)
 
     def result(self) -> FilteredTrajectory:
-        """All rows in the order of time, out of the filter's order of the error state."""
-        rows = sorted(self._rows, key=lambda row: row.timestamp_s)
-        times = np.array([row.timestamp_s for row in rows])
-        rotation = np.array([row.rotation for row in rows]).reshape(-1, 3, 3)
-        centers = np.array([row.center for row in rows]).reshape(-1, 3)
-        change = np.linalg.inv(error_from_tangent(rotation))
-        covariance = np.array([row.covariance for row in rows]).reshape(-1, 6, 6)
-        at = {float(row.timestamp_s): k for k, row in enumerate(rows)}
-        state = self._anchor or self._start
+        """All rows in the order of time."""
+        rows, state = self._rows.table(), self._anchor or self._start
+        innovation = np.array(self._innovation).reshape(-1, 6)
         return FilteredTrajectory(
-            times, rigid3.inverse(rigid3.from_matrix(rotation, centers)),
-            change @ covariance @ change.swapaxes(1, 2), np.array([row.since_pose_s for row in rows]),
-            np.array([row.is_bridged for row in rows], bool),
-            np.array([at.get(frame_s, -1) for frame_s in self._frame_s], np.int64), np.array(self._nis),
+            rows[:, 0], rows[:, 1:8], rows[:, 8:44].reshape(-1, 6, 6), rows[:, 44], rows[:, 45] == 1.0,
+            np.array(self._frame_row, np.int64), innovation, (innovation**2).sum(1),
             np.array(self._is_rejected, bool), "imu",
-            state.gyro_bias, state.accel_bias, np.array([row.latency_s for row in rows]),
-            np.array([row.widening for row in rows]),
+            state.gyro_bias, state.accel_bias, rows[:, 46], rows[:, 47],
         )  # fmt: skip
 
     def _begin_at(self, timestamp_s: float, pose: tuple[Array, Array, Array], shared: Shared, begin: float) -> None:
@@ -331,7 +365,7 @@ class InertialFilter:
         state.begin(*pose, shared)
         self._used_s, self._in_a_row, self._is_waiting = timestamp_s, 0, False
         self._hold(state, timestamp_s)
-        self._note(state, timestamp_s, False, begin)
+        self._note_frame(state, timestamp_s, False, begin)
 
     def _stop(self) -> None:
         """Begin anew with the next pose, with the biases and the gravity that are known by now."""
@@ -382,17 +416,26 @@ class InertialFilter:
     def _correct(self, state: FilterState, pose: tuple[Array, Array, Array], shared: Shared) -> bool:
         """By the pose of a frame, if the motion does not contradict it."""
         center, rotation, noise = pose
+        self._since_forgotten += 1
         state.drift(shared, noise, center)
         noise = shared.white * noise
         innovation = state.innovation(center, rotation)
-        self._nis[-1] = state.nis(innovation, noise)
-        self._recent.append(min(self._nis[-1], self._options.max_nis))
-        if self._nis[-1] > self._options.max_nis:
+        white = state.whitened(innovation, noise)
+        self._innovation[-6:] = array("d", white)
+        nis = float(white @ white)
+        self._recent.append(min(nis, self._options.max_nis))
+        if nis > self._options.max_nis:
             self._in_a_row += 1
             if self._in_a_row <= self._options.max_rejected:
                 self._is_rejected[-1] = True
                 return False
+            if self._since_forgotten < _WINDOW:
+                # the motion jumped, and again: it is what the sensor is taken for that is wrong
+                state.doubt()
+                self._start, self._anchor, self._since_forgotten = state, None, _WINDOW
+                return False
             state.forget(innovation)
+            self._since_forgotten = 0
         self._in_a_row = 0
         state.correct(innovation, noise)
         return True
@@ -407,8 +450,16 @@ class InertialFilter:
         mean = sum(self._recent) / (6.0 * num)
         return mean if mean > (1.0 - small + _QUANTILE * math.sqrt(small)) ** 3 else 1.0
 
-    def _note(self, state: FilterState, now: float, is_bridged: bool, begin: float) -> None:
+    def _note(self, state: FilterState, now: float, is_bridged: bool, begin: float) -> FilteredRow:
         rotation, center, covariance = state.camera()
         spent = time.perf_counter() - begin
         wider = self._widening()
-        self._rows.append(_Row(now, rotation, center, wider * covariance, now - self._used_s, is_bridged, spent, wider))
+        row = FilteredRow(now, rotation, center, wider * covariance, now - self._used_s, is_bridged, spent, wider)
+        self._rows.add(row)
+        return row
+
+    def _note_frame(self, state: FilterState, now: float, is_bridged: bool, begin: float) -> None:
+        """The row of the newest frame; samples and frames that come later are later ones."""
+        self._note(state, now, is_bridged, begin)
+        self._rows.settle(now)
+        self._frame_row[-1] = self._rows.num_settled - 1

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 import threading
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.contradictions import Contradiction
 from sfmapp.events import Event, Events
+from sfmapp.formats.atomic import replaced_file
 from sfmapp.geometry import similarity
 from sfmapp.images.imu_stream import ImuStream
 from sfmapp.images.live_sequence import LiveSequence
@@ -89,29 +92,46 @@ class SharedErrors:
         return Shared(self._last_white, walk, renewed)
 
 
+class _Frame(NamedTuple):
+    """A frame as it was given out; ``moved`` is its ``map_moved``."""
+
+    name: str
+    timestamp_s: float
+    pose: Array
+    covariance: Array
+    shared: Shared
+    moved: Array
+
+
 @dataclass
 class _MapFilter:
     """What is filtered in one live map.
 
     Attributes:
-        names: of its frames, with and without a pose; times_s and poses beside them.
+        frames: with and without a pose, until the sensor predicts; of later ones the filter has what it needs.
+        num_with_pose: of all.
+        shares: three numbers of each frame since the filter begins. rejected: of these frames.
         scale: metres per unit of the live poses, by the sensor.
+        sensed_s: the last sample that the filter had.
         reason: why the sensor does not predict yet.
     """
 
-    names: list[str] = field(default_factory=list)
-    times_s: list[float] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    shares: list[Shared] = field(default_factory=list)
-    moved: list[Array] = field(default_factory=list)
-    first: int = 0
+    frames: list[_Frame] = field(default_factory=list)
+    num_with_pose: int = 0
+    shares: array[float] = field(default_factory=lambda: array("d"))
+    rejected: list[RejectedPose] = field(default_factory=list)
     inertial: InertialFilter | None = None
     scale: float = 1.0
-    next_sample: int = 0
+    sensed_s: float = -math.inf
     clock_offset_s: float = 0.0
-    tried_s: float = -np.inf
+    tried_s: float = -math.inf
     reason: str = ""
+
+    def keep(self, frame: _Frame, rejected_nis: float | None) -> None:
+        """What the report needs of a frame that the filter had."""
+        self.shares.extend(frame.shared)
+        if rejected_nis is not None:
+            self.rejected.append(_rejected(frame, rejected_nis))
 
 
 def filter_beside(sequence: Sequence) -> LiveFilter:
@@ -172,18 +192,14 @@ class LiveFilter:
         if self._current < 0:
             return
         now = self._maps[self._current]
-        now.names.append(frame.name)
-        now.times_s.append(frame.timestamp_s)
-        now.poses.append(frame.cam_from_world)
-        now.covariances.append(frame.covariance)
-        now.shares.append(shared)
-        now.moved.append(frame.map_moved)
-        if self._imu is None:
-            return
-        if now.inertial is not None:
-            self._go_on(now, now.inertial, len(now.times_s) - 1)
-        elif has_pose:
-            self._begin(now, self._imu.recorded() if isinstance(self._imu, ImuStream) else self._imu)
+        now.num_with_pose += has_pose
+        taken = _Frame(frame.name, frame.timestamp_s, frame.cam_from_world, frame.covariance, shared, frame.map_moved)
+        if self._imu is not None and now.inertial is not None:
+            now.keep(taken, self._go_on(now, now.inertial, taken))
+        else:
+            now.frames.append(taken)
+            if self._imu is not None and has_pose:
+                self._begin(now, self._imu.recorded() if isinstance(self._imu, ImuStream) else self._imu)
         if isinstance(self._imu, ImuStream) and now.inertial is not None:  # what came while it was busy
             self._sense(now, now.inertial, math.inf)
 
@@ -199,119 +215,123 @@ class LiveFilter:
 
     def _sense(self, now: _MapFilter, inertial: InertialFilter, until_s: float) -> None:
         """The samples until a moment."""
-        while (sample := self._sample(now.next_sample)) is not None and sample[0] - now.clock_offset_s <= until_s:
-            inertial.add_sample(float(sample[0]) - now.clock_offset_s, sample[1:4], sample[4:])
-            now.next_sample += 1
+        while len(samples := self._samples(now.sensed_s, until_s + now.clock_offset_s)):
+            for sample in samples:
+                inertial.add_sample(float(sample[0]) - now.clock_offset_s, sample[1:4], sample[4:])
+            now.sensed_s = float(samples[-1][0])
 
-    def _sample(self, idx: int) -> Array | None:
-        """(7,) time, rates and forces; None where there is none yet."""
+    def _samples(self, after_s: float, until_s: float) -> Array | list[Array]:
+        """Time, rates and forces (7,) of each after a moment until another one, on the sensor's clock."""
         imu = self._imu
+        if imu is None:
+            return []
         if isinstance(imu, ImuStream):
-            return imu.sample(idx)
-        if imu is None or idx >= len(imu.timestamps_s):
-            return None
-        return np.concatenate([imu.timestamps_s[idx : idx + 1], imu.gyro[idx], imu.accel[idx]])
+            return [sample for sample in imu.after(after_s) if sample[0] <= until_s]
+        some = slice(*np.searchsorted(imu.timestamps_s, [after_s, until_s], "right").tolist())
+        return np.column_stack([imu.timestamps_s[some], imu.gyro[some], imu.accel[some]])
 
     def _begin(self, now: _MapFilter, imu: Imu) -> None:
         """Look for a start in the last seconds, once in a while, and go through them: what the filter knows at their
         end, and how sure it is, follows from the poses and their covariances as it does later."""
-        times = np.array(now.times_s)
-        if times[-1] - times[0] < SHORTEST_S or times[-1] - now.tried_s < STEP_S:
+        first_s, last_s = now.frames[0].timestamp_s, now.frames[-1].timestamp_s
+        if last_s - first_s < SHORTEST_S or last_s - now.tried_s < STEP_S:
             return
-        now.tried_s = float(times[-1])
-        recent = np.flatnonzero(times >= times[-1] - LONGEST_S)
-        found = start_of(times[recent], _in_last_map(now, recent), until(imu, now.tried_s), is_metric=self._is_metric)
+        now.tried_s = last_s
+        recent = [frame for frame in now.frames if frame.timestamp_s >= last_s - LONGEST_S]
+        times = np.array([frame.timestamp_s for frame in recent])
+        found = start_of(times, _in_last_map(recent), until(imu, last_s), is_metric=self._is_metric)
         if isinstance(found, str):
             now.reason = found
             return
         now.scale, now.clock_offset_s = found.scale, found.clock_offset_s
-        measured = [int(n) for n in recent if np.isfinite(now.covariances[n]).all()]
-        first = next((n for n in measured if now.shares[n] is not INDEPENDENT), measured[0])
-        # the last samples before the frame tell the first after it
-        after = int(np.searchsorted(imu.timestamps_s - now.clock_offset_s, times[first], "right"))
-        now.next_sample = max(0, after - 2)
+        measured = [n for n, frame in enumerate(recent) if np.isfinite(frame.covariance).all()]
+        first = next((n for n in measured if recent[n].shared is not INDEPENDENT), measured[0])
+        # the last two samples before the frame tell the first after it
+        before = np.searchsorted(imu.timestamps_s - now.clock_offset_s, times[first], "right") - 3
+        now.sensed_s = float(imu.timestamps_s[before]) if before >= 0 else -math.inf
         inertial = InertialFilter(found.sensor, _UNKNOWN_SPEED)
-        for n in range(first, len(times)):
-            self._go_on(now, inertial, n)
+        nis = None
+        for frame in recent[first:]:
+            nis = self._go_on(now, inertial, frame)
         now.reason = why_too_early(*inertial.start_sigmas)
         if not now.reason:
             inertial.settle()
             inertial.on_pose = self._on_pose
-            now.inertial, now.first = inertial, len(times) - 1
+            now.inertial = inertial
+            now.frames.clear()
+            now.keep(recent[-1], nis)
 
-    def _go_on(self, now: _MapFilter, inertial: InertialFilter, n: int) -> None:
-        """The samples until a frame, and the frame."""
-        frame_s = now.times_s[n]
+    def _go_on(self, now: _MapFilter, inertial: InertialFilter, frame: _Frame) -> float | None:
+        """The samples until a frame, and the frame; its NIS if its pose was not believed."""
+        frame_s = frame.timestamp_s
         self._sense(now, inertial, frame_s)
         measured = read_measured(
-            [frame_s], in_metres(now.poses[n][None], now.scale), scale_covariance(now.covariances[n], now.scale)[None]
+            [frame_s], in_metres(frame.pose[None], now.scale), scale_covariance(frame.covariance, now.scale)[None]
         )
-        inertial.add_frame(frame_s, measured.pose(0), now.shares[n], in_metres(now.moved[n], now.scale))
+        return inertial.add_frame(frame_s, measured.pose(0), frame.shared, in_metres(frame.moved, now.scale))
 
     def finish(self, events: Events) -> tuple[FilteredTrajectory, FilterReport] | None:
         """What was found of the map with the most poses, and what there is to say of it; None without a frame."""
         if not self._maps:
             return None
-        most = max(self._maps.values(), key=lambda entry: int(np.isfinite(np.array(entry.poses)[:, 0]).sum()))
+        most = max(self._maps.values(), key=lambda entry: entry.num_with_pose)
         if most.inertial is not None:
-            found = most.inertial.result()
+            found, shares = most.inertial.result(), np.array(most.shares).reshape(-1, 3)
         else:
-            found = _at_constant_velocity(most)
-        names = most.names[most.first :]
-        shares = np.array(most.shares)[most.first :]
+            found, shares = _at_constant_velocity(most.frames), np.array([frame.shared for frame in most.frames])
+            most.rejected = [_rejected(most.frames[f], float(found.nis[f])) for f in np.flatnonzero(found.is_rejected)]
         reason = (most.reason or "the map was too short") if self._imu is not None and most.inertial is None else None
-        report = _report(found, names, most.times_s[most.first :], shares, reason)
+        report = _report(found, most.rejected, shares, reason)
         events.decided(STAGE, _told(report), **report)
         return found, report
 
 
-def _in_last_map(now: _MapFilter, frames: NDArray[np.int64]) -> Array:
-    """(N, 7) poses of some frames, the last one among them, as the map has them now that adjustments have moved it."""
+def _rejected(frame: _Frame, nis: float) -> RejectedPose:
+    return RejectedPose(
+        name=frame.name, timestamp_s=frame.timestamp_s,
+        reason=f"the motion contradicts it: NIS {nis:.0f} of 6 degrees of freedom, at most {LIVE.max_nis:g} is "
+        "believed",
+    )  # fmt: skip
+
+
+def _in_last_map(frames: list[_Frame]) -> Array:
+    """(N, 7) poses of frames, as the map has them at the last one now that adjustments have moved it."""
     poses, before_from_now = np.full((len(frames), 7), np.nan), similarity.IDENTITY
     for k in range(len(frames) - 1, -1, -1):
-        if np.isfinite(now.poses[frames[k]][0]):
-            poses[k] = similarity.transform_poses(similarity.inverse(before_from_now), now.poses[frames[k]])
-        before_from_now = similarity.compose(now.moved[frames[k]], before_from_now)
+        if np.isfinite(frames[k].pose[0]):
+            poses[k] = similarity.transform_poses(similarity.inverse(before_from_now), frames[k].pose)
+        before_from_now = similarity.compose(frames[k].moved, before_from_now)
     return poses
 
 
-def _at_constant_velocity(entry: _MapFilter) -> FilteredTrajectory:
+def _at_constant_velocity(frames: list[_Frame]) -> FilteredTrajectory:
     """The same by the poses alone. What walks with the map is motion to this filter; what frames share is added to what
     it says of itself."""
-    covariances, white = np.array(entry.covariances), np.array([share.white for share in entry.shares])[:, None, None]
-    found = filter_trajectory(entry.times_s, np.array(entry.poses), white * covariances)
+    covariances = np.array([frame.covariance for frame in frames])
+    white = np.array([frame.shared.white for frame in frames])[:, None, None]
+    found = filter_trajectory(
+        [frame.timestamp_s for frame in frames], np.array([frame.pose for frame in frames]), white * covariances
+    )
     common = np.where(np.isfinite(covariances), (1.0 - white) * covariances, 0.0)
     rows = np.flatnonzero(found.frame_row >= 0)
     return replace(found, covariance=found.covariance + common[rows])
 
 
-def filtered_csv(found: FilteredTrajectory) -> str:
+def write_filtered_csv(path: Path, found: FilteredTrajectory) -> None:
     """How sure each pose is, and what it hangs on."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
     position, rotation = found.position_sigma, np.degrees(found.rotation_sigma_rad)
-    for n, timestamp_s in enumerate(found.timestamps_s):
-        writer.writerow([
-            repr(float(timestamp_s)), f"{position[n]:.6g}", f"{rotation[n]:.6g}", f"{found.since_pose_s[n]:.6g}",
-            int(found.is_bridged[n]), f"{1e3 * found.latency_s[n]:.4g}",
-        ])  # fmt: skip
-    return text.getvalue()
+    columns = (found.timestamps_s, position, rotation, found.since_pose_s, found.is_bridged, 1e3 * found.latency_s)
+    with replaced_file(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for timestamp_s, *sigmas, since_s, is_bridged, latency_ms in zip(*columns, strict=True):
+            numbers = [f"{value:.6g}" for value in (*sigmas, since_s)]
+            writer.writerow([repr(float(timestamp_s)), *numbers, int(is_bridged), f"{latency_ms:.4g}"])
 
 
-def _report(
-    found: FilteredTrajectory, names: list[str], times_s: list[float], shares: Array, reason: str | None
-) -> FilterReport:
+def _report(found: FilteredTrajectory, rejected: list[RejectedPose], shares: Array, reason: str | None) -> FilterReport:
     latency = 1e3 * found.latency_s if len(found.latency_s) else np.zeros(1)
     rate = 1.0 / float(np.median(np.diff(found.timestamps_s))) if len(found.timestamps_s) > 1 else 0.0
-    rejected = [
-        RejectedPose(
-            name=names[f], timestamp_s=times_s[f],
-            reason=f"the motion contradicts it: NIS {found.nis[f]:.0f} of 6 degrees of freedom, at most "
-            f"{LIVE.max_nis:g} is believed",
-        )
-        for f in np.flatnonzero(found.is_rejected)
-    ]  # fmt: skip
     rows = found.frame_row[found.frame_row >= 0]
     white, walk, _ = np.median(shares, axis=0).tolist() if len(shares) else Shared(1.0, 0.0)
     return FilterReport(
@@ -319,7 +339,7 @@ def _report(
         num_used=int((found.since_pose_s[rows] == 0.0).sum()), rejected=rejected, gaps=list(_gaps(found)),
         latency_ms_median=float(np.median(latency)), latency_ms_p95=float(np.percentile(latency, 95)),
         latency_ms_max=float(latency.max()), white_share=white, walk_share=walk, reason=reason,
-        consistency=consistency(found.nis), contradictions=_contradictions(found),
+        consistency=consistency(found.nis, found.innovation), contradictions=_contradictions(found),
     )  # fmt: skip
 
 
@@ -359,7 +379,8 @@ def _told(report: FilterReport) -> str:
     if report.consistency is not None:
         told = report.consistency
         text += (
-            f"; innovations {told.mean:.2f} of what is expected ({told.mean_low:.2f} to {told.mean_high:.2f} by "
-            f"chance), {told.share_inside:.0%} inside 95 %"
+            f"; innovations {told.mean:.2f} of what is expected ({told.correlated_low:.2f} to "
+            f"{told.correlated_high:.2f} by chance: {told.num_innovations} that are worth {told.num_independent:.0f} "
+            f"independent ones), {told.share_inside:.0%} inside 95 %"
         )
     return text if report.reason is None else f"{text}; not by the IMU: {report.reason}"

@@ -18,7 +18,7 @@ from sfmapp.formats.trajectory import write_kitti, write_tum
 from sfmapp.formats.trajectory_input import read_tum
 from sfmapp.odometry.report import MapFacts
 from sfmapp.odometry.result import FrameState, MapResult, OdometryResult
-from sfmapp.pipelines.odometry.filtering import filtered_csv
+from sfmapp.pipelines.odometry.filtering import write_filtered_csv
 from sfmapp.pipelines.odometry.live import live_counts, numbered
 from sfmapp.pipelines.odometry.timing import frame_statistics
 from sfmapp.report.document import named_params
@@ -121,7 +121,7 @@ def write_trajectories(workspace: Workspace, result: OdometryResult, facts: Fram
         write_tum(folder / name, result.timestamps_s, poses)
     if result.filtered is not None:
         write_tum(folder / "trajectory_filtered.tum", result.filtered.timestamps_s, result.filtered.cam_from_world)
-        workspace.write_text("trajectory_filtered.csv", filtered_csv(result.filtered))
+        write_filtered_csv(folder / "trajectory_filtered.csv", result.filtered)
     if result.maps:
         write_kitti(folder / "trajectory.kitti", poses_of_map(result, 0), result.frame_idx)
 
