@@ -197,6 +197,22 @@ def test_feature_files_round_trip(tmp_path: Path) -> None:
         read_feature_file(path)
 
 
+def test_pairs_that_follow_one_another_have_images_in_common() -> None:
+    place = np.random.default_rng(0).permutation(200)  # along a street, whose photographs have names by chance
+    pairs = [
+        (i, j) for i in range(200) for j in range(i + 1, 200) if abs(int(place[i]) - int(place[j])) <= 8
+    ]  # fmt: skip
+
+    def num_images(ordered: list[tuple[int, int]]) -> float:
+        blocks = [ordered[start : start + 64] for start in range(0, len(ordered), 64)]
+        return float(np.mean([len({i for pair in block for i in pair}) for block in blocks]))
+
+    ordered = stage._by_squares(pairs, 200, is_sparse=True)
+    assert sorted(ordered) == pairs
+    assert num_images(pairs) > 45
+    assert num_images(ordered) < 20
+
+
 def test_threads_drop_what_has_not_begun_when_closed() -> None:
     begun: list[int] = []
 

@@ -45,8 +45,8 @@ __all__ = [
 ]
 
 _STAGE = "matching"
-# Pairs go to workers that share no memory in blocks of at most so many images by as many: 16 files of a megabyte are
-# read for 64 pairs, which take some seconds, and progress comes as often.
+# Pairs are done square by square of so many images by as many. Workers that share no memory get as many pairs as one
+# holds at a time: they take some seconds, and progress comes as often.
 _BLOCK = 8
 # In one or two pairs it may be anything that went by.
 _MANY_MOVING = 3
@@ -151,18 +151,38 @@ def _blocks(pairs: list[tuple[int, int]], image_set: ImageSet, executor: Executo
     Pairs of the same images follow one another also in the first case, for those who read them from a database.
     """
     images = image_set.images
-    squares: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for i, j in pairs:
-        squares.setdefault((i // _BLOCK, j // _BLOCK), []).append((i, j))
-    parts = list(squares.values())
-    if executor.folder is None:
-        parts = [[pair] for part in parts for pair in part]
+    ordered = _by_squares(pairs, len(images), is_sparse=executor.folder is not None)
+    size = 1 if executor.folder is None else _BLOCK**2
+    parts = [ordered[start : start + size] for start in range(0, len(ordered), size)]
     blocks = []
     for part in parts:
         both = sorted({i for pair in part for i in pair})
         names = {i: images[i].name for i in both} if executor.folder is not None else {}
         blocks.append(_Block(tuple(part), names, {i: image_set.cameras[images[i].camera_idx] for i in both}))
     return blocks
+
+
+def _by_squares(pairs: list[tuple[int, int]], num_images: int, *, is_sparse: bool) -> list[tuple[int, int]]:
+    """Pairs square by square of the table of all pairs, so that those that follow one another have images in common.
+
+    Where ``is_sparse``, images are numbered anew if that brings those that are compared nearer to each other (Cuthill
+    and McKee, Reducing the bandwidth of sparse symmetric matrices, 1969): where names say nothing of places, 64 pairs
+    of 10,000 images on a plane then have 36 images and not 74; where names follow a walk over it they have 31.
+    """
+    table = np.array(pairs, np.int64).reshape(-1, 2)
+    if is_sparse and len(table):
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+        graph = coo_matrix((np.ones(len(table)), table.T), shape=(num_images, num_images)).tocsr()
+        rank = np.empty(num_images, np.int64)
+        rank[reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True)] = np.arange(num_images)
+        numbered = rank[table]
+        if np.ptp(numbered, axis=1).mean() < np.ptp(table, axis=1).mean():
+            table = numbered
+    square = np.sort(table, axis=1) // _BLOCK
+    order = np.lexsort((table[:, 1], table[:, 0], square[:, 1], square[:, 0]))
+    return [pairs[n] for n in order.tolist()]
 
 
 def _work(
@@ -200,7 +220,7 @@ def _match_stored(folder: Path, options: MatchingOptions, seed: int, block: _Blo
     return _match_block(lambda i: _read_side(folder, block.names[i], options), options, seed, block)
 
 
-@lru_cache(maxsize=4 * _BLOCK)
+@lru_cache(maxsize=_BLOCK**2)
 def _read_side(folder: Path, name: str, options: MatchingOptions) -> tuple[Features, Ints | None]:
     features = read_feature_file(feature_file(folder, name))
     return features, guided.background_of(features) if is_guidable(features, options) else None
