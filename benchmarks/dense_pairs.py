@@ -32,7 +32,7 @@ from sfmapp.dense.files import read_patches
 from sfmapp.dense.maps import splat_view
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.photographs import find_photographs
-from sfmapp.dense.prepare import load_scene, plan_views
+from sfmapp.dense.prepare import load_scene, part_of, plan_views
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.formats.colmap import read_model
 from sfmapp.geometry import rigid3
@@ -191,7 +191,7 @@ def photographed(
     patch = np.repeat(np.arange(len(strong)), strong.num_views)
     for pair in pairs:
         chosen = sorted(next(n for n, name in enumerate(names) if one in name) for one in pair)
-        scene = replace(load_scene(plan, np.array(chosen)), neighbors=np.array([[1], [0]], np.int32))
+        scene = replace(load_scene(part_of(plan, np.array(chosen))), neighbors=np.array([[1], [0]], np.int32))
         of_both = np.intersect1d(*(patch[strong.view_idx == m] for m in chosen))
         truths = [
             splat_view(

@@ -38,7 +38,7 @@ from sfmapp.dense.maps import splat_view
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.outcome import LEAST_DEVIATION, NOISE_FACTOR, WINDOW_PX, noise_deviation
 from sfmapp.dense.photographs import Photographs, find_photographs
-from sfmapp.dense.prepare import load_scene, plan_views
+from sfmapp.dense.prepare import load_scene, part_of, plan_views
 from sfmapp.dense.scene import DenseScene, DenseView, Patches
 from sfmapp.dense.selection import select_neighbors
 from sfmapp.formats.colmap import read_model
@@ -97,7 +97,7 @@ def courtyard(model_folder: Path) -> tuple[list[Score], dict[str, float]]:
     for name in REFERENCES:
         view = plan.names.index(name)
         used = np.unique([view, *[int(m) for m in plan.neighbors[view] if m >= 0][:NEIGHBORS]])
-        swept, at = SweptScene(load_scene(plan, used)), int(np.searchsorted(used, view))
+        swept, at = SweptScene(load_scene(part_of(plan, used))), int(np.searchsorted(used, view))
         reference = swept.scene.views[at]
         depth, second = (depth_of(patches, reference) for patches in (patches_without(model, found, used), everything))
         depth[~textured(reference)] = np.nan

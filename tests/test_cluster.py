@@ -16,14 +16,19 @@ import numpy as np
 import pytest
 
 import sfmapp
+from dense_models import write_wall
 from sfmapp.cluster.address import num_local
 from sfmapp.cluster.worker import WorkerError, do_unit, facts, why_unfit
+from sfmapp.dense import clusters
+from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
 from sfmapp.executor import Threads
 from sfmapp.formats.feature_files import feature_file, read_feature_file, write_feature_file
 from sfmapp.matching import stage
+from sfmapp.pipelines.dense.densify import dense
 from sfmapp.scene.features import DescriptorMetric, Features
+from sfmapp.workspace.options import Options
 
 dask_executor = pytest.importorskip("sfmapp.cluster.dask_executor", reason="dask.distributed is not installed")
 
@@ -156,6 +161,23 @@ def test_a_unit_that_ends_its_workers_is_named() -> None:
 
     with pytest.raises(WorkerError, match=r"4 workers were lost over one unit of work, tls://127\.0\.0\.1:1234 last"):
         dask_executor._result(Job())
+
+
+def test_clusters_of_views_are_the_same_patches_by_workers(
+    client: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_wall(tmp_path)
+    monkeypatch.setattr(clusters, "BASE_MB", 498.8)  # so that two or three of these small views fit
+    monkeypatch.setattr(dask_executor, "_client", lambda *_: client)
+    options = Options(dense=DenseOptions(cell_px=2, max_neighbors=2, max_memory_mb=500), threads=1)
+    files = []
+    for name, address in (("threads", None), ("workers", "local:1")):
+        chosen, images = replace(options, cluster=address), tmp_path / "images"
+        result = dense(tmp_path / "sparse" / "0", tmp_path / name, chosen, images=images, record=False)
+        assert len(result.report["clusters"]) >= 2
+        files.append((tmp_path / name / "dense" / "patches.npz").read_bytes())
+    assert files[0] == files[1]
+    assert not list((tmp_path / "workers").glob(".cluster-*"))
 
 
 @pytest.mark.parametrize("address", ["local", "local:0", "local:1000", "http://a:1", "tcp://a", "tcp://a:b", "a:1"])

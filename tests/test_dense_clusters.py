@@ -14,7 +14,7 @@ from sfmapp.dense.clusters import BASE_MB, Cluster, in_core, make_clusters, merg
 from sfmapp.dense.densify import densify
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.photographs import find_photographs
-from sfmapp.dense.prepare import DensePlan, load_scene, plan_views
+from sfmapp.dense.prepare import DensePlan, load_scene, part_of, plan_views
 from sfmapp.dense.scene import Patches
 from sfmapp.images.image_set import ImageOptions
 
@@ -55,7 +55,7 @@ def test_clusters_make_the_same_surface(plan: DensePlan) -> None:
     whole, _ = densify(load_scene(plan), OPTIONS)
     parts = []
     for cluster in parts_of(plan):
-        patches, _ = densify(load_scene(plan, cluster.views, core=cluster.core), OPTIONS)
+        patches, _ = densify(load_scene(part_of(plan, cluster.views, cluster.core)), OPTIONS)
         mine = in_core(patches, cluster)
         assert np.isin(mine.reference_idx, cluster.core).all()
         parts.append(mine)
@@ -108,7 +108,8 @@ def test_a_double_goes_and_a_second_layer_stays(plan: DensePlan) -> None:
 def test_a_cluster_does_not_depend_on_threads(plan: DensePlan, tmp_path: Path) -> None:
     cluster = parts_of(plan)[0]
     first, second = (
-        densify(load_scene(plan, cluster.views, core=cluster.core, threads=n), OPTIONS, threads=n)[0] for n in (1, 2)
+        densify(load_scene(part_of(plan, cluster.views, cluster.core), threads=n), OPTIONS, threads=n)[0]
+        for n in (1, 2)
     )
     np.testing.assert_array_equal(first.xyz, second.xyz)
     np.testing.assert_array_equal(first.view_idx, second.view_idx)

@@ -18,7 +18,7 @@ from sfmapp.dense.files import read_patches, write_fused_ply, write_patches
 from sfmapp.dense.maps import splat_view
 from sfmapp.dense.options import DenseOptions
 from sfmapp.dense.photographs import find_photographs, scaled_camera
-from sfmapp.dense.prepare import DensePlan, load_scene, plan_views
+from sfmapp.dense.prepare import DensePlan, load_scene, part_of, plan_views
 from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.dense.selection import meeting_point, select_neighbors
 from sfmapp.dense.undistort import lay_out, make_canvas
@@ -341,7 +341,7 @@ def test_where_axes_meet() -> None:
 def test_a_part_of_a_plan(tmp_path: Path) -> None:
     model = write_wall(tmp_path, 6)
     plan = plan_of(tmp_path, model, DenseOptions(max_neighbors=3))
-    whole, part = load_scene(plan, threads=2), load_scene(plan, np.array([1, 2, 4]), core=np.array([2]))
+    whole, part = load_scene(plan, threads=2), load_scene(part_of(plan, np.array([1, 2, 4]), np.array([2])))
     assert [view.name for view in part.views] == ["view_1.png", "view_2.png", "view_4.png"]
     np.testing.assert_array_equal(part.views[2].rgb, whole.views[4].rgb)
     assert (part.neighbors[[0, 2]] == -1).all()

@@ -115,6 +115,10 @@ def _add_dense_flags(parser: argparse.ArgumentParser) -> None:
         help="lower and upper corners of the box to reconstruct",
     )  # fmt: skip
     group.add_argument("--max-memory", metavar="MB", help="split the views into clusters that need less than this")
+    group.add_argument(
+        "--cluster", metavar="ADDRESS",
+        help="have workers densify clusters of views: local:4, or tcp://HOST:PORT of a scheduler of dask",
+    )  # fmt: skip
     group.add_argument("--no-recording", action="store_true", help="do not write dense/recording.rrd")
 
 
@@ -140,6 +144,7 @@ def _dense(args: argparse.Namespace) -> int:
         "images.mask_path": args.mask_path,
         "dense.region": None if args.region is None else ",".join(args.region),
         "dense.max_memory_mb": args.max_memory,
+        "cluster": args.cluster,
     }
     options = _options(args, flags)
     load_numba_without_blas()

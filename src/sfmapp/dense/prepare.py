@@ -125,20 +125,36 @@ def coarser_plan(plan: DensePlan, longer_side_px: int) -> DensePlan:
     return replace(plan, canvases=canvases)
 
 
-def load_scene(
-    plan: DensePlan,
-    view_idx: NDArray[np.integer] | None = None,
-    *,
-    core: NDArray[np.integer] | None = None,
-    threads: int = 1,
-    events: Events | None = None,
-) -> DenseScene:
-    """Read, undistort and shrink the photographs of a plan, or of some of its views.
+def part_of(
+    plan: DensePlan, view_idx: NDArray[np.integer], core: NDArray[np.integer] | None = None
+) -> DensePlan:  # fmt: skip
+    """Some views of a plan as a plan of their own, and the sparse points that two of them see.
 
     Args:
-        plan: what to read.
-        view_idx: (W,) positions of the views wanted, ascending; None: all.
+        plan: of all views.
+        view_idx: (W,) positions of the views wanted, ascending.
         core: those of them that get neighbours, others only serve as such; None: all.
+    """
+    wanted = np.asarray(view_idx)
+    position = np.full(len(plan.records) + 1, -1, np.int32)  # the last for "none"
+    position[wanted] = np.arange(len(wanted))
+    neighbors = _compact(position[plan.neighbors[wanted]])
+    if core is not None:
+        neighbors[~np.isin(wanted, core)] = -1
+    ptr, seen = _seen_by(plan.point_ptr, position[plan.point_view_idx])
+    kept = np.diff(ptr) >= 2
+    ptr, seen = _only(ptr, seen, kept)
+    return DensePlan(
+        tuple(plan.records[m] for m in wanted), tuple(plan.canvases[m] for m in wanted), plan.cam_from_world[wanted],
+        neighbors, plan.point_xyz[kept], ptr, seen, plan.region,
+    )  # fmt: skip
+
+
+def load_scene(plan: DensePlan, *, threads: int = 1, events: Events | None = None) -> DenseScene:
+    """Read, undistort and shrink the photographs of a plan.
+
+    Args:
+        plan: what to read; see :func:`part_of` for some of it.
         threads: photographs that are worked on at a time.
         events: progress and cancellation.
 
@@ -147,8 +163,7 @@ def load_scene(
         InterruptedRunError: ``events`` was asked to stop.
     """
     events = events or Events()
-    wanted = np.arange(len(plan.records)) if view_idx is None else np.asarray(view_idx)
-    events.started(STAGE, f"undistorting {len(wanted)} photographs", total=len(wanted))
+    events.started(STAGE, f"undistorting {len(plan.records)} photographs", total=len(plan.records))
 
     def load(m: int) -> DenseView:
         events.raise_if_cancelled()
@@ -158,17 +173,9 @@ def load_scene(
         return DenseView(record.name, rgb, mask, plan.canvases[m].k, plan.cam_from_world[m], record.orientation)
 
     with ThreadPoolExecutor(threads) as pool:
-        views = tuple(pool.map(load, wanted.tolist()))
+        views = tuple(pool.map(load, range(len(plan.records))))
     events.finished(STAGE, f"{len(views)} views")
-    position = np.full(len(plan.records) + 1, -1, np.int32)  # the last for "none"
-    position[wanted] = np.arange(len(wanted))
-    neighbors = _compact(position[plan.neighbors[wanted]])
-    if core is not None:
-        neighbors[~np.isin(wanted, core)] = -1
-    ptr, seen = _seen_by(plan.point_ptr, position[plan.point_view_idx])
-    kept = np.diff(ptr) >= 2
-    ptr, seen = _only(ptr, seen, kept)
-    return DenseScene(views, neighbors, plan.point_xyz[kept], ptr, seen, plan.region)
+    return DenseScene(views, plan.neighbors, plan.point_xyz, plan.point_ptr, plan.point_view_idx, plan.region)
 
 
 def _compact(rows: NDArray[np.int32]) -> NDArray[np.int32]:

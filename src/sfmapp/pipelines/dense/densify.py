@@ -11,23 +11,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from sfmapp.dense import outcome
-from sfmapp.dense.clusters import Cluster, in_core, make_clusters, merge_clusters
-from sfmapp.dense.densify import densify
+from sfmapp.dense.clusters import Cluster, make_clusters, merge_clusters
 from sfmapp.dense.files import read_patches
-from sfmapp.dense.options import FEWEST_VIEWS
-from sfmapp.dense.prepare import DensePlan, load_scene
+from sfmapp.dense.prepare import DensePlan
 from sfmapp.dense.report import ClusterReport
 from sfmapp.dense.scene import Patches
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.pipelines.dense import results as dense_results
+from sfmapp.pipelines.dense.parts import densify_clusters
 from sfmapp.pipelines.dense.results import STAGE
 from sfmapp.pipelines.dense.source import DenseJob, calibrate_source, dense_job, find_source, model_digest, plan_source
 from sfmapp.report.model import DenseReport, Outcome
-from sfmapp.stereo.patches import densify_pair
 from sfmapp.workspace.kernels import compile_dense_kernels
 from sfmapp.workspace.keys import input_key, stage_key
 from sfmapp.workspace.manifest import AsBeforeError
@@ -143,19 +139,26 @@ def _densify(
             STAGE, f"{len(plan.records)} views in {len(clusters)} clusters to stay below {options.max_memory_mb} MB",
             sizes=sizes, memory_mb=[round(cluster.memory_mb) for cluster in clusters],
         )  # fmt: skip
-    parts: list[Patches] = []
-    rows: list[dense_results.PartReport] = []
-    told: list[ClusterReport] = []
+    done: dict[int, tuple[Patches, dense_results.PartReport]] = {}
+    if is_resumed and len(clusters) > 1:
+        found = ((number, dense_results.read_part(job, plan, number)) for number in range(len(clusters)))
+        done = {number: part for number, part in found if part is not None}
+    known = set(done)
     with job.stage(STAGE):
-        for number, cluster in enumerate(clusters):
-            known = dense_results.read_part(job, plan, number) if is_resumed else None
-            part, row = known or _densify_cluster(job, plan, cluster)
-            if known is None and len(clusters) > 1:
+        ahead = [number for number in range(len(clusters)) if number not in known]
+        for number, part, row in densify_clusters(job, plan, clusters, ahead):
+            if len(clusters) > 1:
                 dense_results.write_part(job, plan, number, part, row)
-            names = [plan.names[m] for m in cluster.core]
-            told.append(ClusterReport(views=names, num_patches=len(part), is_resumed=known is not None))
-            parts.append(part)
-            rows.append(row)
+            done[number] = part, row
+        parts = [done[number][0] for number in range(len(clusters))]
+        rows = [done[number][1] for number in range(len(clusters))]
+        told = [
+            ClusterReport(
+                views=[plan.names[m] for m in cluster.core], num_patches=len(parts[number]),
+                is_resumed=number in known,
+            )
+            for number, cluster in enumerate(clusters)
+        ]  # fmt: skip
         patches = merge_clusters(plan, options.cell_px, parts) if len(parts) > 1 else parts[0]
         if plan.region is not None:
             patches = patches.subset(plan.region.holds(patches.xyz))
@@ -171,17 +174,3 @@ def _densify(
         report, clusters=told, levels=total.levels, waves=total.waves, funnel=total.funnel, seeds=total.seeds,
         two_views=total.two_views, shares=shares, **dense_results.summary(patches),
     )  # fmt: skip
-
-
-def _densify_cluster(job: DenseJob, plan: DensePlan, cluster: Cluster) -> tuple[Patches, dense_results.PartReport]:
-    is_whole = len(cluster.core) == len(plan.records)
-    scene = load_scene(
-        plan, cluster.views, core=None if is_whole else cluster.core, threads=job.threads, events=job.events
-    )
-    texture = [outcome.textured_pixels(scene.views[at]) for at in np.searchsorted(cluster.views, cluster.core)]
-    is_pair = is_whole and len(scene.views) == FEWEST_VIEWS
-    make = densify_pair if is_pair else densify
-    patches, row = make(scene, job.options.dense, threads=job.threads, events=job.events)
-    # all of them are of the core: hundreds of megabytes that need no copy
-    mine = patches if is_whole else in_core(patches, cluster)
-    return mine, dense_results.PartReport(**row, texture=texture, num_points=len(scene.point_xyz))

@@ -12,7 +12,7 @@ from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
 from sfmapp.carve.feature_occupancy import STAGE, sweep_features
 from sfmapp.carve.views import view_of_camera
-from sfmapp.dense.prepare import DensePlan, load_scene
+from sfmapp.dense.prepare import DensePlan, load_scene, part_of
 from sfmapp.dense.pyramid import noise_deviation
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events
@@ -57,7 +57,7 @@ def write_occupancy(plan: DensePlan, cells: int, folder: Path, events: Events) -
     views, edges = [], []
     for v in range(len(plan.records)):
         events.raise_if_cancelled()
-        view = load_scene(plan, np.array([v])).views[0]
+        view = load_scene(part_of(plan, np.array([v]))).views[0]
         camera = Camera(CameraModel.PINHOLE, view.width, view.height, view.k)
         views.append(view_of_camera(view.name, camera, view.cam_from_world))
         edges.append(edges_of(view.rgb, view.mask))

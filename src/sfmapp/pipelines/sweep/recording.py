@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfmapp.carve.feature_occupancy import FeatureOccupancy
-from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene
+from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene, part_of
 from sfmapp.pipelines.sweep.occupancy import FILES
 from sfmapp.report.sweep_document import SweepReport, SweptView
 from sfmapp.viewer.sweep_recording import ShownMap, record_sweep
@@ -42,7 +42,7 @@ def write_recording(job: Job, plan: DensePlan, report: SweepReport, folder: Path
 
 def _shown(small: DensePlan, told: SweptView, folder: Path) -> ShownMap:
     """A map at the pixels of the smaller photograph that are nearest."""
-    view = load_scene(small, np.array([small.names.index(told.name)])).views[0]
+    view = load_scene(part_of(small, np.array([small.names.index(told.name)]))).views[0]
     depth, sigma = (np.load(folder / f"{told.name}.{what}.npy") for what in ("depth", "sigma"))
     rows, columns = (
         ((np.arange(count) + 0.5) * full / count).astype(int)

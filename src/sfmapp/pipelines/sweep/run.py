@@ -21,7 +21,7 @@ from sfmapp.carve.sweep_agreement import confirm
 from sfmapp.carve.sweep_exchange import exchange_planes
 from sfmapp.dense.maps import depth_picture, write_cameras, write_picture
 from sfmapp.dense.photographs import find_photographs
-from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene, plan_views
+from sfmapp.dense.prepare import DensePlan, coarser_plan, load_scene, part_of, plan_views
 from sfmapp.dense.report import ViewsReport
 from sfmapp.dense.scene import DenseScene, DenseView
 from sfmapp.errors import NoReconstructionError
@@ -156,7 +156,7 @@ def _pictures(job: _Job, maps: list[SweptView]) -> list[SweptPicture]:
     pictures = []
     for place in np.unique(np.linspace(0, len(maps) - 1, min(len(maps), MOST_SHOWN)).round().astype(int)):
         view = plan.names.index(maps[place].name)
-        rgb = load_scene(plan, np.array([view]), threads=job.threads).views[0].rgb
+        rgb = load_scene(part_of(plan, np.array([view])), threads=job.threads).views[0].rgb
         depth, sigma = (np.load(folder / f"{maps[place].name}.{what}.npy") for what in ("depth", "sigma"))
         pictures.append(SweptPicture(int(place), rgb, depth, sigma))
     return pictures
@@ -218,7 +218,7 @@ def _around(job: _Job, view: int) -> tuple[DenseScene, NDArray[np.int64]]:
     """A view and those it is swept with, and their numbers, ascending."""
     wanted = np.unique([view, *_others(job.plan, view)])
     # what is read quietly is a part of this step
-    return load_scene(job.plan, wanted, threads=job.threads), wanted
+    return load_scene(part_of(job.plan, wanted), threads=job.threads), wanted
 
 
 def _earlier(job: _Job, view: int) -> SweptPlanes | None:
