@@ -97,7 +97,7 @@ def test_the_run_that_follows_finds_its_plan_and_what_was_counted_in_it(
 
 def test_more_of_everything_costs_more(photos: Path, planned: PlanReport, known: machine.Machine) -> None:
     plan = planned
-    fewer = sfmapp.plan(photos, sfmapp.load_options([], ["features.max_num_features=1000"]))
+    fewer = sfmapp.plan(photos, sfmapp.load_options([], ["features.max_num_features=1000"]), mesh=True)
     assert fewer.num_features.likely <= 7000 < plan.num_features.likely
     assert fewer.disk_mb.likely < 0.5 * plan.disk_mb.likely
     for stage in (*plan.stages, plan.whole):
@@ -106,6 +106,8 @@ def test_more_of_everything_costs_more(photos: Path, planned: PlanReport, known:
         assert stage.wall_s.likely <= stage.cpu_s.likely + 1e-9
     assert plan.whole.memory_mb.likely == max(stage.memory_mb.likely for stage in plan.stages)
     assert plan.whole.cpu_s.likely >= sum(stage.cpu_s.likely for stage in plan.stages)
+    assert [stage.stage for stage in fewer.surface] == ["dense", "mesh"]
+    assert plan.surface == []
 
 
 def test_memory_follows_the_size_of_photographs_and_the_workers(photos: Path, known: machine.Machine) -> None:
@@ -179,7 +181,7 @@ def test_another_place_among_photographs_is_named(photos: Path, known: machine.M
     assert found.names == ["wall_0.png", "wall_1.png", "wall_2.png"]
     cv2.imwrite(str(folder / "alone.png"), textured(4)[:300, :400])
     alone = [doubt.names for doubt in warnings(sfmapp.plan(folder)) if doubt.subject == "overlap"]
-    assert ["alone.png"] in alone
+    assert alone == [["wall_0.png", "wall_1.png", "wall_2.png"], ["alone.png"]]
 
 
 def test_memory_and_disk_that_are_not_there_are_told(

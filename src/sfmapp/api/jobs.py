@@ -138,6 +138,8 @@ def plan(
     images: Images,
     options: Options | None = None,
     *,
+    dense: bool = False,
+    mesh: bool = False,
     events: Events | None = None,
     threads: int | None = None,
     seed: int | None = None,
@@ -151,6 +153,7 @@ def plan(
     Args:
         images: as ``reconstruct`` takes them.
         options: of all stages; see ``load_options``.
+        dense, mesh: tell as well, roughly, what patches and a mesh of them will take.
         events: told of everything that happens, and can ask it to stop.
         threads: workers of the run; None: as ``options.threads`` says, or as many as there are cores.
         seed: in place of ``options.seed``.
@@ -170,7 +173,7 @@ def plan(
     """
     from sfmapp.pipelines.planning import plan as pipeline
 
-    return pipeline.plan(images, options_with(options, threads, seed), events=events)
+    return pipeline.plan(images, options_with(options, threads, seed), dense=dense, mesh=mesh, events=events)
 
 
 def track_sequence(

@@ -10,12 +10,13 @@ from sfmapp.cli.common import add_output_flags, listening, load_numba_without_bl
 from sfmapp.cli.reconstruct import add_option_flags, effective_options
 
 if TYPE_CHECKING:
-    from sfmapp.report.plan import PlanReport
+    from sfmapp.report.plan import PlanReport, StagePlan
 
 EXAMPLES = """\
 examples:
   sfmapp plan photos/
   sfmapp plan photos/ --preset quality --threads 4
+  sfmapp plan photos/ --mesh
 
 Takes the options of reconstruct. Photographs are looked at in small, a few are worked on as the run will do it, and the
 machine is measured once by the bundled sample; nothing is written but what is remembered in the user's cache. The run
@@ -30,6 +31,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("images", metavar="IMAGES", help="a folder, a quoted glob, or a .txt list of files")
+    parser.add_argument("--dense", action="store_true", help="tell of dense patches as well")
+    parser.add_argument("--mesh", action="store_true", help="tell of dense patches and their mesh as well")
     add_option_flags(parser)
     add_output_flags(parser)
     parser.set_defaults(run=_plan)
@@ -43,7 +46,7 @@ def _plan(args: argparse.Namespace) -> int:
 
     watch = Stopwatch(whole_process=True)
     with listening(args) as events:
-        report = plan(args.images, options, events=events, watch=watch)
+        report = plan(args.images, options, dense=args.dense, mesh=args.mesh, events=events, watch=watch)
     if args.json:
         print_json({"exit_code": 0, **report})
     elif not args.quiet:
@@ -55,18 +58,19 @@ def _lines(plan: PlanReport) -> Iterator[str]:
     """A plan in words."""
     skipped = f" ({plan.num_skipped} files cannot be used)" if plan.num_skipped else ""
     yield f"{plan.num_images} photographs of {plan.megapixels:.0f} megapixels in all{skipped}"
-    for camera in plan.cameras[:_CAMERAS]:
+    for camera in sorted(plan.cameras, key=lambda camera: -camera.num_images)[:_CAMERAS]:
         whose = f"{camera.name}, " if camera.name else ""
         focal = "focal length unknown" if camera.focal_source == "default" else f"f {camera.focal_px:.0f} px"
         yield f"  {camera.num_images} by {whose}{camera.width}x{camera.height}, {camera.model}, {focal}"
     if len(plan.cameras) > _CAMERAS:
         yield f"  and {len(plan.cameras) - _CAMERAS} cameras more"
     sizes = [size for size in plan.groups if size > 1]
-    alone = plan.groups.count(1) if isinstance(plan.groups, list) else sum(size == 1 for size in plan.groups)
+    alone = sum(size == 1 for size in plan.groups)
     if len(sizes) == 1 and not alone:
         yield "  all of them are linked by what they show"
     else:
-        text = f"in groups of {', '.join(map(str, sizes[:_CAMERAS]))}" if sizes else "none linked with another"
+        shown = ", ".join(map(str, sizes[:_GROUPS])) + (", ..." if len(sizes) > _GROUPS else "")
+        text = f"in groups of {shown} that show the same" if sizes else "none linked with another"
         yield f"  {text}" + (f", {alone} alone" if sizes and alone else "")
     yield (
         f"{plan.num_pairs} pairs ({plan.pairs_reason}), {plan.num_overlapping.text('overlap')}; "
@@ -74,11 +78,11 @@ def _lines(plan: PlanReport) -> Iterator[str]:
     )
     yield f"{'':<12}{'CPU s':>16}{'s':>16}{'MB':>16}"
     for stage in [*plan.stages, plan.whole]:
-        cells = [
-            _cell(stage.cpu_s.low, stage.cpu_s.high), _cell(stage.wall_s.low, stage.wall_s.high),
-            _cell(stage.memory_mb.low, stage.memory_mb.high),
-        ]  # fmt: skip
-        yield f"{stage.stage:<12}" + "".join(f"{cell:>16}" for cell in cells)
+        yield _row(stage)
+    if plan.surface:
+        yield f"and then, roughly, {plan.surface_disk_mb.text('MB')} of disk and"
+        for stage in plan.surface:
+            yield _row(stage)
     machine = plan.machine
     yield (
         f"on {plan.threads} threads of {machine.processor}, with nothing else at work; most memory in "
@@ -93,7 +97,13 @@ def _lines(plan: PlanReport) -> Iterator[str]:
 
 
 # that are told one by one
-_CAMERAS = 4
+_CAMERAS, _GROUPS = 4, 12
+
+
+def _row(stage: StagePlan) -> str:
+    """A line of the table."""
+    cells = [_cell(each.low, each.high) for each in (stage.cpu_s, stage.wall_s, stage.memory_mb)]
+    return f"{stage.stage:<12}" + "".join(f"{cell:>16}" for cell in cells)
 
 
 def _cell(low: float, high: float) -> str:

@@ -81,7 +81,7 @@ def plan_views(
     depth = _median_depths(poses, xyz, ptr, view_idx)
     _check_baseline(poses, depth, photographs)
     canvases = tuple(
-        make_canvas(camera, _shrink(options, camera.width, camera.height, camera.focal, float(z)))
+        make_canvas(camera, working_shrink(options, camera.width, camera.height, camera.focal, float(z)))
         for camera, z in zip(photographs.cameras, depth, strict=True)
     )
     focal = np.array([canvas.k[:2].mean() for canvas in canvases])
@@ -237,8 +237,9 @@ def _median_depths(
     return depth
 
 
-def _shrink(options: DenseOptions, width: int, height: int, focal: float, depth: float) -> float:
-    """Pixels at full resolution for one at working resolution, a side."""
+def working_shrink(options: DenseOptions, width: int, height: int, focal: float, depth: float) -> float:
+    """Pixels at full resolution for one at working resolution, a side; focal length in pixels, depth in units of the
+    world."""
     if options.ground_sampling is not None:
         # a smaller image than of this many pixels shows nothing
         return float(np.clip(options.ground_sampling * focal / depth, 1.0, max(min(width, height) / 32.0, 1.0)))

@@ -111,6 +111,7 @@ class PlanReport(Report):
         pairs_reason: how they are chosen, in words.
         num_features, num_matches, num_observations: in all.
         stages: in their order; ``whole``: all of them, with the start of the program.
+        surface: patches and mesh after them, if they were asked for: roughly. ``surface_disk_mb``: what they write.
         peak_stage: whose memory is the peak.
         disk_mb: that the output takes.
         took: what planning itself took.
@@ -135,6 +136,8 @@ class PlanReport(Report):
     whole: StagePlan
     peak_stage: str
     disk_mb: Interval
+    surface: Sequence[StagePlan]
+    surface_disk_mb: Interval
     doubts: Sequence[Doubt]
     machine: MachineFacts
     took: Usage

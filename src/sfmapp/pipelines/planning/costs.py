@@ -30,8 +30,9 @@ _REPEATED = 0.08
 # in shares of this; it starts anew where matches contradict a model, which nobody knows beforehand.
 _OBS_PER_IMAGE = 3300.0
 _MAPPING_BELOW, _MAPPING_ABOVE = 0.35, 1.2
-# Where photographs fall into parts that share little, models are grown apart and joined.
-_PER_PART = 0.8
+# Where photographs fall into parts that share little, models are grown apart and joined; with many, what is grown anew
+# is small.
+_PER_PART, _MOST_PARTS = 0.8, 4
 # Where photographs say where they were taken, models are adjusted to that and held against it.
 _WITH_POSITIONS = 2.2
 # Links with fewer matches than this share of a photograph's best one hold parts together loosely.
@@ -101,7 +102,7 @@ def estimate(given: Given) -> Estimate:
     cores = min(given.options.num_workers, given.machine.cores)
     stages = [
         StagePlan(
-            stage=name, cpu_s=seconds, wall_s=_wall(seconds, _PARALLEL.get(name, 0.0), cores),
+            stage=name, cpu_s=seconds, wall_s=wall_of(seconds, _PARALLEL.get(name, 0.0), cores),
             memory_mb=memory.get(name, memory["images"]),
         )
         for name, seconds in cpu.items()
@@ -232,8 +233,11 @@ def _matching_cpu(given: Given) -> Interval:
 def _mapping_cpu(given: Given, observations: Interval) -> Interval:
     machine, num_images = given.machine, len(given.images)
     unit = machine.usage["mapping"].cpu_s / (_OBS_PER_IMAGE * machine.num_images + machine.num_observations)
-    parts = num_parts(given.links, num_images)
-    likely = unit * (_OBS_PER_IMAGE * num_images + observations.likely) * (1.0 + _PER_PART * (parts - 1))
+    likely = 0.0
+    for group in given.links.groups(num_images):
+        costs = _OBS_PER_IMAGE * len(group) + observations.likely * len(group) / num_images
+        parts = min(num_parts(given.links.among(group, num_images), num_images), _MOST_PARTS)
+        likely += unit * costs * (1.0 + _PER_PART * (parts - 1))
     if 2 * sum(image.position is not None for image in given.images) > num_images:
         likely *= _WITH_POSITIONS
     return Interval.about(likely, _MAPPING_BELOW, _MAPPING_ABOVE)
@@ -258,8 +262,8 @@ def _beside(machine: Machine) -> float:
     return max(0.0, machine.run.cpu_s - counted)
 
 
-def _wall(cpu_s: Interval, parallel: float, cores: int) -> Interval:
-    """After Amdahl."""
+def wall_of(cpu_s: Interval, parallel: float, cores: int) -> Interval:
+    """Seconds on so many cores of work that can be shared out in part, after Amdahl."""
     share = 1.0 - parallel + parallel / max(1, cores)
     return Interval(*(share * value for value in (cpu_s.low, cpu_s.likely, cpu_s.high)))
 
@@ -270,9 +274,7 @@ def _wall(cpu_s: Interval, parallel: float, cores: int) -> Interval:
 def _memory(given: Given, num_features: Interval, matches: Interval, observations: Interval) -> dict[str, Interval]:
     """Peaks of the process in MB by stage. What features took is kept for as long as their descriptors are."""
     machine, options = given.machine, given.options
-    program = max(
-        0.0, (machine.run.peak_memory_mb or 0.0) - machine.extraction_mb - machine.num_features * _FEATURE_BYTES / 1e6
-    )
+    program = program_mb(machine)
     needs = sorted((bytes_of_extraction(image, options.features) for image in given.images), reverse=True)
     at_once, budget = 0, bytes_for_extraction(options.features)
     for need in needs[: options.num_workers]:
@@ -291,6 +293,12 @@ def _memory(given: Given, num_features: Interval, matches: Interval, observation
         "mapping": max(scratch + kept + found, 0.2 * kept + found + mapping),
     }
     return {name: Interval.about(program + extra / 1e6, 0.15) for name, extra in peaks.items()}
+
+
+def program_mb(machine: Machine) -> float:
+    """Memory of the program with its kernels, 1e6 bytes: what the sample took beside its pictures and features."""
+    pictures = machine.extraction_mb + machine.num_features * _FEATURE_BYTES / 1e6
+    return max(0.0, (machine.run.peak_memory_mb or 0.0) - pictures)
 
 
 def _disk(given: Given, num_features: Interval, matches: Interval, observations: Interval) -> Interval:

@@ -28,6 +28,8 @@ _BLURRED_SET = 0.5
 # Burnt out or black is a photograph with this share of its pixels more so than the set's median: objects before white
 # or black are none.
 _EXPOSED = 0.3
+# photographs that tell what is usual
+_ENOUGH = 4
 # Photographs are the same whose small versions correlate so well, and whose features have not moved, in the median, by
 # this share of the diagonal: half a pixel of a small version. Objects before black correlate to 0.999 and have moved.
 _ALIKE, _STILL = 0.98, 1e-3
@@ -47,7 +49,7 @@ def find_doubts(
     images = image_set.images
     found = [
         *_of_files(report, looks, images),
-        *_of_quality(looks, images),
+        *_of_quality(looks, images, links.groups(len(images))),
         *_of_copies(looks, images, report.duplicates),
         *_of_cameras(report, images),
         *_of_groups(links, images, looks),
@@ -70,19 +72,28 @@ def _of_files(report: ImagesReport, looks: Sequence[Look], images: Sequence[Imag
         yield _doubt("note", "files", names, problem, "see whether that is meant")
 
 
-def _of_quality(looks: Sequence[Look], images: Sequence[ImageRecord]) -> Iterator[Doubt]:
-    if not looks:
-        return
+def _usual(values: NDArray[np.float64], groups: Sequence[Sequence[int]]) -> NDArray[np.float64]:
+    """For each photograph what is usual among those that show the same, or among all where these are few."""
+    usual = np.full(len(values), np.nanmedian(values))
+    for group in groups:
+        if len(group) >= _ENOUGH and np.isfinite(values[group]).any():
+            usual[group] = np.nanmedian(values[group])
+    return usual
+
+
+def _of_quality(
+    looks: Sequence[Look], images: Sequence[ImageRecord], groups: Sequence[Sequence[int]]
+) -> Iterator[Doubt]:
     blur = np.array([look.quality.blur for look in looks])
     if np.isfinite(blur).any():
-        median = float(np.nanmedian(blur))
+        median, usual = float(np.nanmedian(blur)), _usual(blur, groups)
         if median > _BLURRED_SET:
             message = f"most photographs are blurred ({median:.2f} on a scale from 0, sharp, to 1; good ones have 0.4)"
             yield Doubt(
                 weight="warning", subject="blur", message=message, names=[],
                 remedy="hold the camera still, give it more light or a shorter exposure; see whether its lens is clean",
             )  # fmt: skip
-        is_blurred = (blur > _BLUR_RATIO * median) & (blur > median + _BLUR_ABOVE)
+        is_blurred = (blur > _BLUR_RATIO * usual) & (blur > usual + _BLUR_ABOVE)
         yield from _named(
             images, is_blurred, "blur", "blurred or shaken, unlike the others",
             "leave them out, or take them again with more light or a shorter exposure",
@@ -93,7 +104,7 @@ def _of_quality(looks: Sequence[Look], images: Sequence[ImageRecord]) -> Iterato
     ):
         share = np.array([getattr(look.quality, subject) for look in looks])
         yield from _named(
-            images, share > np.median(share) + _EXPOSED, "exposure", f"{text}, unlike in the others",
+            images, share > _usual(share, groups) + _EXPOSED, "exposure", f"{text}, unlike in the others",
             "take them again with the exposure of the others, or mask what is plain",
         )  # fmt: skip
     few = np.array([len(look.features) < FEW_FEATURES and not look.problem for look in looks])
@@ -146,11 +157,10 @@ def _of_cameras(report: ImagesReport, images: Sequence[ImageRecord]) -> Iterator
     without = [camera for camera in report.cameras if camera.focal_source == "default"]
     if without:
         num = sum(camera.num_images for camera in without)
-        whose = (
-            "none of the photographs says" if num == len(images) else f"{num} of {len(images)} photographs do not say"
-        )
+        whose = "all" if num == len(images) else f"{num} of {len(images)}"
         yield Doubt(
-            weight="note", subject="focal length", message=f"{whose} how long its focal length is", names=[],
+            weight="note", subject="focal length", message=f"the focal length of {whose} photographs is not known",
+            names=[],
             remedy="it will be searched from the pairs; a calibration is better: --camera",
         )  # fmt: skip
     if len(report.cameras) > 1 and len(report.cameras) == len(images):
@@ -166,13 +176,14 @@ def _of_groups(links: Links, images: Sequence[ImageRecord], looks: Sequence[Look
         return
     groups = links.groups(len(images))
     others = [group for group in groups[1:] if len(group) > 1]
-    for group in others:
-        names = [images[i].name for i in group]
-        yield _doubt(
-            "warning", "overlap", names,
-            f"{len(group)} photographs that show nothing of what the other {len(images) - len(group)} show: another "
-            "place?",
-            "reconstruct them apart, or add photographs between the two",
+    if others:
+        shown = [f"{len(group)} ({images[group[0]].name}, ...)" for group in others[:_NAMES_SHOWN]]
+        more = f" and {len(others) - _NAMES_SHOWN} groups more" if len(others) > _NAMES_SHOWN else ""
+        yield Doubt(
+            weight="warning", subject="overlap", names=[images[i].name for group in others for i in group],
+            message=f"beside the {len(groups[0])} photographs with {images[groups[0][0]].name} there are such as show "
+            f"nothing of these: {', '.join(shown)}{more}: other places?",
+            remedy="reconstruct them apart, or add photographs between them",
         )  # fmt: skip
     alone = np.zeros(len(images), bool)
     alone[[group[0] for group in groups[0 if len(groups[0]) == 1 else 1 :] if len(group) == 1]] = True

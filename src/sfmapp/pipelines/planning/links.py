@@ -68,6 +68,15 @@ class Links:
                 num_matches[position[pair]] = max(1, num_matches[position[pair]])
         return replace(self, num_matches=num_matches)
 
+    def among(self, group: Sequence[int], num_images: int) -> Links:
+        """Pairs of the photographs of a group, at least one."""
+        is_in = np.zeros(num_images, bool)
+        is_in[list(group)] = True
+        inside = is_in[self.pairs].all(axis=1)
+        return Links(
+            self.pairs[inside], self.num_matches[inside], self.num_putative[inside], self.config[inside], self.num_all
+        )
+
     def joined(self, other: Links) -> Links:
         """With other pairs of the same run."""
         return Links(
@@ -142,6 +151,7 @@ def find_links(
             is_loose[links.groups(len(features))[0]] = False
             rest = rest[is_loose[pairs[rest]].any(axis=1)]
             if len(rest):
+                events.started(STAGE, f"comparing {len(rest)} more pairs of photographs apart", total=len(rest))
                 links = links.joined(links_of(rest, pool))
         except BaseException:
             pool.shutdown(cancel_futures=True)

@@ -23,10 +23,11 @@ from sfmapp.pipelines.planning.doubts import find_doubts
 from sfmapp.pipelines.planning.links import Links, find_links
 from sfmapp.pipelines.planning.look import Look, look_at_all
 from sfmapp.pipelines.planning.machine import BUSY, Machine, known_machine, load
+from sfmapp.pipelines.planning.surface_costs import surface_costs
 from sfmapp.pipelines.planning.trial import choose_images, try_images
 from sfmapp.pipelines.sparse.keys import stage_keys
 from sfmapp.pipelines.sparse.planned import plan_key, remember_plan
-from sfmapp.report.plan import FORMAT, Doubt, MachineFacts, PlannedCamera, PlanReport
+from sfmapp.report.plan import FORMAT, Doubt, Interval, MachineFacts, PlannedCamera, PlanReport
 from sfmapp.reporting import Usage
 from sfmapp.workspace.kernels import PAIR_MODULES, kernels_compiling
 from sfmapp.workspace.options import Options, with_absolute_paths
@@ -47,8 +48,9 @@ _MEMORY_SHARE = 0.9
 
 
 def plan(
-    images: Images, options: Options | None = None, *, events: Events | None = None, watch: Stopwatch | None = None
-) -> PlanReport:
+    images: Images, options: Options | None = None, *, dense: bool = False, mesh: bool = False,
+    events: Events | None = None, watch: Stopwatch | None = None,
+) -> PlanReport:  # fmt: skip
     """Tell what :func:`~sfmapp.reconstruct` with these photographs and options will take, and what will go wrong.
 
     The plan is remembered for this user, and the run that follows compares itself with it in its report.
@@ -56,6 +58,7 @@ def plan(
     Args:
         images: as ``reconstruct`` takes them.
         options: of all stages.
+        dense, mesh: tell as well what patches, and a mesh of them, will take.
         events: told of what is done, and asked whether to stop.
         watch: started earlier, if more is to be counted than this call.
 
@@ -83,6 +86,9 @@ def plan(
         *_of_machine(told, machine),
     ]
     report = _report(name_of(images), image_set, found, given, selected, told, doubts)
+    if dense or mesh:
+        surface, disk_mb = surface_costs(given, mesh=mesh)
+        report = replace(report, surface=surface, surface_disk_mb=disk_mb)
     remember_plan(report)
     return replace(report, took=watch.read())
 
@@ -209,6 +215,8 @@ def _report(
         whole=told.whole,
         peak_stage=told.peak_stage,
         disk_mb=told.disk_mb,
+        surface=[],
+        surface_disk_mb=Interval(0.0, 0.0, 0.0),
         doubts=doubts,
         machine=MachineFacts(
             processor=machine.processor, cores=machine.cores, memory_mb=_memory_mb(), free_disk_mb=_free_disk_mb(),
