@@ -26,6 +26,7 @@ FLOORS = (
     ("pipelines",),
     ("workspace",),
     ("report", "viewer"),
+    ("video",),
     ("odometry",),
     ("carve",),
     ("surface",),

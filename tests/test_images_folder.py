@@ -499,7 +499,7 @@ def test_formats_that_are_not_read_are_named(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"x")
     image_set, _, log = load(tmp_path)
     assert [name for name, _ in image_set.skipped] == ["a.heic", "b.CR2", "c.mp4", "d.gif"]
-    assert any("c.mp4: .mp4 files are not read: extract frames" in e.message for e in log)
+    assert any("c.mp4: .mp4 files are not read: name the video itself" in e.message for e in log)
 
 
 def test_format_is_what_the_bytes_say(tmp_path: Path) -> None:

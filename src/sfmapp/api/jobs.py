@@ -16,7 +16,7 @@ from sfmapp.api.reconstruction import Reconstruction
 from sfmapp.api.stages import extract_features, map_images, match_images
 from sfmapp.errors import UsageError
 from sfmapp.events import Event, Events, Listener
-from sfmapp.images.load import Images
+from sfmapp.images.load import GivenImages, Images
 from sfmapp.workspace.options import Options
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class TrackResult(NamedTuple):
 
 
 def reconstruct(
-    images: Images,
+    images: GivenImages,
     output: FilePath | None = None,
     options: Options | None = None,
     *,
@@ -80,8 +80,9 @@ def reconstruct(
 
     Args:
         images: whatever ``load_images`` takes: a folder, a glob pattern or a ``.txt`` list of files; arrays by name; an
-            :class:`ImageSource`; an :class:`ImageSet`. No pixels are kept of those that are no files: what looks at
-            them again (``densify``, ``undistort``, ``validate``) wants them as files, and says so.
+            :class:`ImageSource`; an :class:`ImageSet`. With an output folder also a video, of which frames are chosen,
+            and several of these in a list. No pixels are kept of those that are no files: what looks at them again
+            (``densify``, ``undistort``, ``validate``) wants them as files, and says so.
         output: folder of the results: new, empty, or of an earlier run. None: nothing is written.
         options: of all stages; see ``load_options``.
         add: the photographs, which are files, are added to the finished reconstruction in the output folder, with its
@@ -104,25 +105,31 @@ def reconstruct(
 
     Example:
         >>> reconstruction, report = sfmapp.reconstruct("photos/", "out/")
+        >>> reconstruction, report = sfmapp.reconstruct("walk.mp4", "out/")
         >>> reconstruction, report = sfmapp.reconstruct("more/", "out/", add=True)
         >>> reconstruction.points.xyz, reconstruction.image("a.jpg").cam_from_world
     """
     if add:
         from sfmapp.pipelines.sparse.add import add_photographs
 
-        if output is None or not isinstance(images, str | os.PathLike):
+        if output is None or not isinstance(images, str | os.PathLike | list | tuple):
             raise UsageError("photographs are added as files, to the reconstruction in an output folder")
-        given = options if options is None and threads is None else options_with(options, threads, seed)
-        found, report = add_photographs(images, output, given, events=events, record=record)
+        asked = options if options is None and threads is None else options_with(options, threads, seed)
+        found, report = add_photographs(images, output, asked, events=events, record=record)
         return RunResult(Reconstruction.of(found), report)
+    from sfmapp.pipelines.sparse.videos import Sources, sources_of
+
     options = options_with(options, threads, seed)
     if output is not None:
         from sfmapp.pipelines.sparse import reconstruct as pipeline
 
         found, report = pipeline.reconstruct(images, output, options, events=events, record=record)
         return RunResult(Reconstruction.of(found), report)
+    given = sources_of(images)
+    if isinstance(given, Sources):
+        raise UsageError("frames of videos, and photographs from several places, need an output folder to be kept in")
     workers, seed_used = options.num_workers, options.seed
-    image_set = load_images(images, options.images, events=events, threads=threads)
+    image_set = load_images(given, options.images, events=events, threads=threads)
     features = extract_features(image_set, options.features, events=events, threads=workers)
     correspondences = match_images(
         image_set, features, options.pairs, options.matching, events=events, threads=workers, seed=seed_used

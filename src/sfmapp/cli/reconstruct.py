@@ -28,6 +28,8 @@ examples:
   sfmapp reconstruct photos/ -o out/
   sfmapp reconstruct photos/ -o out/ --preset quality --set features.max_num_features=12000
   sfmapp reconstruct photos/ -o out/ --dense --mesh
+  sfmapp reconstruct walk.mp4 -o out/
+  sfmapp reconstruct walk.mp4 more.mp4 photos/ -o out/ --frames-max 200
   sfmapp reconstruct photos/ -o out/ --camera calibration.yaml
   sfmapp reconstruct more/ -o out/ --add
   sfmapp reconstruct 'frames/*.png' -o out/ --camera-model OPENCV_FISHEYE --seed 7
@@ -40,10 +42,13 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the commands of this family to the parser."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = commands.add_parser(
-        "reconstruct", help="photographs to cameras and points", epilog=EXAMPLES, formatter_class=raw,
-        description="Reconstruct cameras and points from photographs.",
+        "reconstruct", help="photographs or videos to cameras and points", epilog=EXAMPLES, formatter_class=raw,
+        description="Reconstruct cameras and points from photographs, or from frames that are chosen of videos.",
     )  # fmt: skip
-    parser.add_argument("images", metavar="IMAGES", nargs="?", help="a folder, a quoted glob, or a .txt list of files")
+    parser.add_argument(
+        "images", metavar="IMAGES", nargs="*",
+        help="a folder, a quoted glob, a .txt list of files, a video, of which frames are chosen, or several of these",
+    )  # fmt: skip
     parser.add_argument("-o", "--output", metavar="OUT", type=Path, help="output folder, created if missing")
     parser.add_argument(
         "--add", action="store_true",
@@ -118,6 +123,7 @@ def add_option_flags(parser: argparse.ArgumentParser) -> None:
         "--fix-poses", action="store_true", help="hold the poses of --pose-priors, and triangulate points from them"
     )
     group.add_argument("--up", metavar="HOW", help="turn models upright: auto, markers, plane or exif (as held)")
+    group.add_argument("--frames-max", metavar="N", help="most frames that are taken of each video")
     group.add_argument("--min-registered", metavar="N", help="exit with code 5 if fewer images are registered")
     group.add_argument("--no-recording", action="store_true", help="do not write recording.rrd, the replay of the run")
 
@@ -140,6 +146,7 @@ def effective_options(args: argparse.Namespace) -> Options:
         "units.up": args.up,
         "poses.file": args.pose_priors,
         "poses.fixed": "true" if args.fix_poses else None,
+        "video.max_frames": args.frames_max,
         "min_registered": args.min_registered,
     }
     settings = [*args.set, *(f"{name}={value}" for name, value in flags.items() if value is not None)]
@@ -149,14 +156,14 @@ def effective_options(args: argparse.Namespace) -> Options:
 def _reconstruct(args: argparse.Namespace) -> int:
     if args.list_options:
         return list_options(args)
-    if args.images is None or args.output is None:
+    if not args.images or args.output is None:
         args.parser.error("IMAGES and -o OUT are needed")
     if args.texture and not args.mesh:
         args.parser.error("--texture needs --mesh")
     if args.texture:
         args.set.append("surface.texture=true")
     options = effective_options(args)
-    report = _run(args, args.images, options)
+    report = _run(args, args.images if len(args.images) > 1 else args.images[0], options)
     result = reconstruction_result(args.output, report)
     if not args.json and not args.quiet:
         print_summary(args.output, report)
@@ -214,7 +221,7 @@ def _demo(args: argparse.Namespace) -> int:
     return 0
 
 
-def _run(args: argparse.Namespace, images: str, options: Options) -> ReconstructionReport:
+def _run(args: argparse.Namespace, images: str | list[str], options: Options) -> ReconstructionReport:
     load_numba_without_blas()
     from sfmapp.pipelines.sparse.add import add_photographs
     from sfmapp.pipelines.sparse.reconstruct import reconstruct

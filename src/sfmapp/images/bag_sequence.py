@@ -77,7 +77,8 @@ class BagSequence(FileSequence):
     def _items(self) -> Iterator[Frame | Skipped]:
         reader = _BagReader(self)
         try:
-            yield from read_ahead(reader)
+            ahead: Iterator[Frame | Skipped] = read_ahead(reader)
+            yield from ahead
         finally:
             reader.close()
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from sfmapp.images.sequence import STAGE, Frame, GroundTruth, Imu, RepeatedFrame
 from sfmapp.scene.rig import Rig
 
 Pixels = NDArray[np.uint8]
+Item = TypeVar("Item")
 
 # What may lie decoded at a time. Each frame of a stereo pair of 1241x376 takes a megabyte.
 _FRAMES_AHEAD = 4
@@ -47,14 +49,14 @@ def skipped_twin(idx: int, name: str, timestamp_s: float, twin_idx: int) -> Skip
     return Skipped(name, REPEATED, RepeatedFrame(idx, name, timestamp_s, twin_idx))
 
 
-def read_ahead(read_next: Callable[[], Frame | Skipped | None]) -> Iterator[Frame | Skipped]:
+def read_ahead(read_next: Callable[[], Item | None]) -> Iterator[Item]:
     """What ``read_next`` returns until None, a few calls ahead of the consumer in one thread of its own.
 
     The calls are made one after another, so that the order and every result are those of a plain loop. If the consumer
     stops early (or fails), closing the generator waits for the call that is under way and makes no other.
     """
     pool = ThreadPoolExecutor(1, "frames")
-    ahead: deque[Future[Frame | Skipped | None]] = deque()
+    ahead: deque[Future[Item | None]] = deque()
     try:
         for _ in range(_FRAMES_AHEAD):
             ahead.append(pool.submit(read_next))

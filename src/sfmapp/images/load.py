@@ -22,10 +22,14 @@ from sfmapp.reporting import NamedReason
 
 Images = str | os.PathLike[str] | ImageSet | ImageSource | Mapping[str, NDArray[Any]]
 """What every function takes for photographs."""
+GivenImages = Images | Sequence[str | os.PathLike[str]]
+"""The same, and several files and folders."""
 
 
-def name_of(images: Images) -> str:
+def name_of(images: GivenImages) -> str:
     """What is written down as the source of the photographs."""
+    if isinstance(images, Sequence) and not isinstance(images, str):
+        return ", ".join(os.path.abspath(one) for one in images)
     if isinstance(images, str | os.PathLike):
         return os.fspath(images)
     root = images.root if isinstance(images, ImageSet) else None

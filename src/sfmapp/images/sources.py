@@ -23,7 +23,7 @@ _RAW_PICTURES = {
     ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".rwl", ".raf", ".pef", ".srw", ".3fr",
     ".iiq", ".erf", ".mef", ".mos", ".kdc", ".dcr", ".x3f", ".gpr",
 }  # fmt: skip
-VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"}
+VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp", ".wmv"}
 _THUMBNAIL_FOLDERS = frozenset({"__MACOSX", "@eaDir"})
 _MAX_LIST_BYTES = 64 << 20
 
@@ -205,7 +205,7 @@ def _take(found: Found, path: Path) -> None:
         return
     name = printable(os.path.relpath(path, found.root))
     if ending in _FOREIGN_PICTURES | _RAW_PICTURES | VIDEOS:
-        advice = "extract frames from them first" if ending in VIDEOS else "convert them to JPEG or PNG"
+        advice = "name the video itself beside the folder" if ending in VIDEOS else "convert them to JPEG or PNG"
         found.skipped.append((name, f"{ending} files are not read: {advice}"))
         return
     content = picture_format(path)

@@ -149,6 +149,24 @@ def _frames_of_device(source: str) -> _Walk:
         capture.release()
 
 
+def missing_end(facts: VideoFacts, span_s: tuple[float, float] | None, num_frames: int) -> str:
+    """How much there was of a file that ended before the end that its header names; empty if it did not.
+
+    Args:
+        facts: of the header. span_s: times of the first and the last frame; None: they have none.
+        num_frames: that there were.
+    """
+    if span_s is not None and facts.end_s is not None:
+        first, last = span_s[0], span_s[1] + 1 / (facts.fps or DEFAULT_FPS)
+        # of a clock that begins late, headers count from its beginning or from zero
+        length = facts.end_s - first if facts.end_s > first else facts.end_s
+        if last - first < _CUT_OFF_SHARE * length:
+            return f"after {last - first:.1f} of {length:.1f} s"
+    elif facts.num_frames is not None and num_frames < _CUT_OFF_SHARE * facts.num_frames:
+        return f"after {num_frames} of {facts.num_frames} frames"
+    return ""
+
+
 @dataclass
 class VideoSequence:
     """A :class:`~sfmapp.images.sequence.Sequence` of a video. A stream or camera can be walked through once; of its
@@ -203,7 +221,8 @@ class VideoSequence:
             self.events.decided(STAGE, f"{shown(self.source)}: {self._buffer.counts.end}")
             return
         try:
-            yield from read_ahead(reader)
+            ahead: Iterator[Frame | Skipped] = read_ahead(reader)
+            yield from ahead
         finally:
             reader.close()
 
@@ -289,17 +308,9 @@ class _VideoReader:
 
     def _end(self) -> Skipped | None:
         """What there is to say of a file that ends before the end that its header names."""
-        facts, has_ended = self._video.facts, self._has_ended
-        self._has_ended = True
+        has_ended, self._has_ended = self._has_ended, True
         if self._video.options.stop is not None or has_ended or self._is_live:
             return None
-        name = f"{self._position:06d}"
-        if self._seen and facts.end_s is not None:
-            first, last = float(self._seen[0]), float(self._seen[-1]) + 1 / (facts.fps or DEFAULT_FPS)
-            # of a clock that begins late, headers count from its beginning or from zero
-            length = facts.end_s - first if facts.end_s > first else facts.end_s
-            if last - first < _CUT_OFF_SHARE * length:
-                return Skipped(name, f"the video ends here, after {last - first:.1f} of {length:.1f} s")
-        elif facts.num_frames is not None and self._position < _CUT_OFF_SHARE * facts.num_frames:
-            return Skipped(name, f"the video ends here, after {self._position} of {facts.num_frames} frames")
-        return None
+        span = (float(self._seen[0]), float(self._seen[-1])) if self._seen else None
+        where = missing_end(self._video.facts, span, self._position)
+        return Skipped(f"{self._position:06d}", f"the video ends here, {where}") if where else None

@@ -39,6 +39,8 @@ _KMEANS_ROUNDS = 12
 # length of an image vector in whole numbers: its square must stay below 2^24
 _VLAD_LENGTH = 4000
 _BLOCK_BYTES = 64 << 20
+# how names of the frames of a video end before the number
+_FRAME = re.compile(r"(?:^|[/_ -])frames?[_ -]?$", re.IGNORECASE)
 
 _RANGES = {
     "exhaustive_limit": Range(0),
@@ -325,8 +327,9 @@ def find_sequences(records: Sequence[ImageRecord]) -> list[list[int]]:
     """Runs of images that were taken one after the other, as far as their names or time stamps tell.
 
     A run of names differs in one number only, and the numbers are dense or mostly equally spaced, as those of a
-    camera's roll or of the frames of a video are; those of photographs from many hands are neither. What is left is
-    ordered by time stamp where one camera took it.
+    camera's roll or of the frames of a video are; those of photographs from many hands are neither. Names that say
+    ``frame`` before the number are of one video, however far apart its frames were chosen. What is left is ordered by
+    time stamp where one camera took it.
     """
     by_pattern: dict[tuple[str, str], list[tuple[int, int]]] = defaultdict(list)
     for i, record in enumerate(records):
@@ -334,9 +337,9 @@ def find_sequences(records: Sequence[ImageRecord]) -> list[list[int]]:
         if match:
             by_pattern[match[1], match[3]].append((int(match[2]), i))
     groups = []
-    for _, numbered in sorted(by_pattern.items()):
+    for (before, _), numbered in sorted(by_pattern.items()):
         ordered = sorted(numbered)
-        if _is_regular([number for number, _ in ordered]):
+        if _FRAME.search(before) or _is_regular([number for number, _ in ordered]):
             groups.append([i for _, i in ordered])
     taken = {i for group in groups for i in group}
     by_camera: dict[tuple[str, str, str], list[int]] = defaultdict(list)

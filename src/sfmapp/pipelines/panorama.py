@@ -143,15 +143,15 @@ def stitch_panorama(
     most = min(options.features.max_num_features, _MOST_FEATURES)
     options = replace(options, features=replace(options.features, max_num_features=most))
     with Run.opened(PANORAMA, name_of(images), output, options, events=events, watch=watch, images=images) as run:
-        report = _run(run, layout)
+        report = _run(run, images, layout)
         return PanoramaResult(run.workspace.folder, run.workspace.folder / layout.file, report)
 
 
-def _run(run: Run, layout: PictureLayout) -> PanoramaReport:
-    if isinstance(run.images, str | os.PathLike) and is_video(os.fspath(run.images)):
-        run.images = _frames_of(run, os.fspath(run.images))
+def _run(run: Run, images: Images, layout: PictureLayout) -> PanoramaReport:
+    if isinstance(images, str | os.PathLike) and is_video(os.fspath(images)):
+        images = _frames_of(run, os.fspath(images))
     with run.stage("images"):
-        image_set, described = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        image_set, described = load_images(images, run.options.images, run.events, threads=run.threads)
         run.image_set, run.stages = image_set, replace(run.stages, images=described)
     keys = stage_keys(run.options, image_set)
     key = stage_key(

@@ -36,6 +36,7 @@ from sfmapp.odometry.report import FilterReport, OdometryReport, ScaleReport
 from sfmapp.report.plan import PlanCheck
 from sfmapp.reporting import NamedReason, Plain, Report, Step, Usage
 from sfmapp.surface.report import MeshReport
+from sfmapp.video.report import VideoReport
 
 Light = Literal["green", "amber", "red"]
 
@@ -272,6 +273,7 @@ class FailedReport(Report):
 class Stages(Report):
     """What each stage of a reconstruction or a dense run said; absent where none was reached."""
 
+    videos: Sequence[VideoReport] | None = None
     images: ImagesReport | None = None
     features: FeaturesReport | None = None
     pairs: PairsReport | None = None

@@ -37,6 +37,7 @@ from sfmapp.odometry.options import OdometryOptions, ScaleOptions
 from sfmapp.option_checks import Range, check_options
 from sfmapp.stereo.options import StereoOptions
 from sfmapp.surface.options import SurfaceOptions
+from sfmapp.video.options import VideoOptions
 from sfmapp.workspace import resources
 
 LIST_ADVICE = "sfmapp reconstruct --list-options shows every option with its default"
@@ -47,7 +48,7 @@ class Options:
     """Options of all stages of a run. The options of a stage live next to its code.
 
     Attributes:
-        images, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
+        images, video, features, pairs, matching, mapping, adjust, gps: the options of the stages of a reconstruction.
         control, units, poses: ground control points of a reconstruction, known lengths and the vertical, known poses.
         dense, surface: those of patches and of the mesh that is made of them.
         sequence, odometry, scale: those of odometry.
@@ -62,6 +63,7 @@ class Options:
     """
 
     images: ImageOptions = field(default_factory=ImageOptions)
+    video: VideoOptions = field(default_factory=VideoOptions)
     features: FeatureOptions = field(default_factory=FeatureOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchingOptions = field(default_factory=MatchingOptions)

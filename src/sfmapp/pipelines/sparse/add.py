@@ -21,8 +21,9 @@ from sfmapp.formats.colmap import read_model
 from sfmapp.formats.database import Database
 from sfmapp.georeference.sources import with_positions
 from sfmapp.georeference.world_frame import GEOREFERENCE
-from sfmapp.images.folder import load_found, load_images
+from sfmapp.images.folder import load_found
 from sfmapp.images.image_set import ImageSet
+from sfmapp.images.load import load_images, name_of
 from sfmapp.images.report import ImagesReport
 from sfmapp.images.sources import Found
 from sfmapp.mapping.closing_move import closing_move
@@ -39,10 +40,12 @@ from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
 from sfmapp.pipelines.sparse.photographs import PHOTOGRAPHS, as_before, link_photographs, with_new
 from sfmapp.pipelines.sparse.reconstruct import RunResult, check_enough, map_and_report
 from sfmapp.pipelines.sparse.run import Before, Run
+from sfmapp.pipelines.sparse.videos import Sources, frames_and_photographs, sources_of
 from sfmapp.pipelines.sparse.world import read_world
 from sfmapp.report.model import AddedPhotograph, AddedReport, ReconstructionReport
 from sfmapp.reporting import NamedReason
 from sfmapp.scene.reconstruction import Reconstruction
+from sfmapp.video.report import VideoReport
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.layout import MANIFEST, PAGE, RECONSTRUCT, REPORT
 from sfmapp.workspace.manifest import Manifest, image_root, missing_photographs, read_manifest
@@ -66,16 +69,18 @@ class _New:
     Attributes:
         root: folder that the names of old and new ones are relative to. names: of the new ones.
         source: where these are from. known: (name, reason) of what was there already.
+        videos: of what frames are chosen.
     """
 
     root: Path
     names: tuple[str, ...]
     source: str
     known: tuple[tuple[str, str], ...]
+    videos: tuple[VideoReport, ...] = ()
 
 
 def add_photographs(
-    images: str | os.PathLike[str],
+    images: str | os.PathLike[str] | Sequence[str],
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
@@ -89,7 +94,8 @@ def add_photographs(
     are chosen for all of them. The models go on from where they were.
 
     Args:
-        images: a folder, a glob pattern or a list. What is there already, by its bytes or its name, is told.
+        images: a folder, a glob pattern, a list or a video, or several of these. What is there already, by its bytes or
+            its name, is told.
         output: of the reconstruction, whose options are used.
         options: None, or such as do not contradict those of the reconstruction.
         events, record, watch: as of :func:`sfmapp.pipelines.sparse.reconstruct.reconstruct`.
@@ -122,7 +128,7 @@ def add_photographs(
         recorder = RecordingListener() if record else None
         with Run.opened(
             RECONSTRUCT, manifest.source, folder / _BESIDE, first, events=events, watch=watch, recorder=recorder,
-            images=os.fspath(images),
+            images=images,
         ) as run:  # fmt: skip
             run.listen(recorder)
             report = _run(run, folder, manifest, new, old_names)
@@ -141,7 +147,7 @@ def _run(
     with run.stage("images"):
         image_set, images, of_before = _all_photographs(run, folder, manifest, new, old_names)
         run.image_set = with_positions(image_set, run.options.gps)
-        run.stages = replace(run.stages, images=images)
+        run.stages = replace(run.stages, images=images, videos=new.videos or None)
     keys = read_world(run, run.image_set)
     database = run.workspace.database
     if not database.is_file():
@@ -195,16 +201,16 @@ def _nothing_new(folder: Path, watch: Stopwatch) -> RunResult:
 
 
 def _new_photographs(
-    images: str | os.PathLike[str], folder: Path, manifest: Manifest, old_names: Sequence[str], options: Options,
-    events: Events,
+    images: str | os.PathLike[str] | Sequence[str], folder: Path, manifest: Manifest, old_names: Sequence[str],
+    options: Options, events: Events,
 ) -> _New:  # fmt: skip
     """Which of some photographs are new, under which names, and the folder that has all of them."""
     root = image_root(manifest)
     if root is None:
         raise missing_photographs(folder, manifest)
-    given, _ = load_images(images, replace(options.images, mask_path=None), events, threads=options.num_workers)
+    given, videos = _given(images, folder, old_names, options, events)
     if not given.images:
-        raise InputError(f"{os.fspath(images)}: no usable photograph to add", "-v names the files and what is wrong")
+        raise InputError(f"{name_of(images)}: no usable photograph to add", "-v names the files and what is wrong")
     of_digest = {digest.split("+")[0]: name for name, digest in manifest.inputs.items()}
     taken, known = set(old_names), list[tuple[str, str]]()
     inside, outside = dict[str, Path](), dict[str, Path]()
@@ -225,7 +231,20 @@ def _new_photographs(
         link_photographs(links, {name: root / name for name in (*old_names, *inside)} if links != root else {})
         link_photographs(links, outside)
         root = links
-    return _New(root, (*inside, *outside), os.path.abspath(images), tuple(known))
+    return _New(root, (*inside, *outside), os.path.abspath(name_of(images)), tuple(known), tuple(videos))
+
+
+def _given(
+    images: str | os.PathLike[str] | Sequence[str], folder: Path, old_names: Sequence[str], options: Options,
+    events: Events,
+) -> tuple[ImageSet, list[VideoReport]]:  # fmt: skip
+    """What is to be added, and what was chosen of the videos in it."""
+    unmasked, sources = replace(options.images, mask_path=None), sources_of(images)
+    if not isinstance(sources, Sources):
+        return load_images(sources, unmasked, events, threads=options.num_workers)[0], []
+    taken = {name.split("/")[0] for name in old_names}
+    found, videos = frames_and_photographs(sources, folder, options, events, taken)
+    return load_found(name_of(images), found, unmasked, events, options.num_workers)[0], videos
 
 
 def _all_photographs(

@@ -14,11 +14,12 @@ from sfmapp.errors import NoReconstructionError, TooFewImagesError, UsageError
 from sfmapp.events import Events
 from sfmapp.formats.colmap import read_model
 from sfmapp.georeference.sources import with_positions
-from sfmapp.images.load import Images, load_images, name_of
+from sfmapp.images.load import GivenImages, name_of
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys
 from sfmapp.pipelines.sparse.matches import find_matches
 from sfmapp.pipelines.sparse.run import Run
+from sfmapp.pipelines.sparse.videos import load_sources
 from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_world
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.layout import RECONSTRUCT
@@ -39,7 +40,7 @@ class RunResult(NamedTuple):
 
 
 def reconstruct(
-    images: Images,
+    images: GivenImages,
     output: str | os.PathLike[str],
     options: Options | None = None,
     *,
@@ -52,8 +53,8 @@ def reconstruct(
     What an earlier run in the same output folder has done is used where it still holds.
 
     Args:
-        images: a folder, a glob pattern or a ``.txt`` list of files; or arrays by name, an :class:`ImageSource`, an
-            :class:`ImageSet`, whose pixels are not kept.
+        images: a folder, a glob pattern, a ``.txt`` list of files, a video, or several of these; or arrays by name, an
+            :class:`ImageSource`, an :class:`ImageSet`, whose pixels are not kept.
         output: folder of the results: new, empty, or of an earlier run.
         options: of all stages; see :func:`sfmapp.load_options`.
         events: listens in, and can ask the run to stop.
@@ -94,7 +95,7 @@ def check_enough(report: ReconstructionReport, options: Options, output: str | o
 def _run(run: Run) -> ReconstructionReport:
     """The job: photographs, what still holds of an earlier run, models, and the report of it all."""
     with run.stage("images"):
-        image_set, images = load_images(run.images, run.options.images, run.events, threads=run.threads)
+        image_set, images = load_sources(run)
         run.image_set = with_positions(image_set, run.options.gps)
         run.stages = replace(run.stages, images=images)
     keys = read_world(run, run.image_set)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.images.load import Images
+from sfmapp.images.load import GivenImages
 from sfmapp.report.model import AddedReport, MergedReport, Stages
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.workspace.job import Job
@@ -59,7 +59,7 @@ class Run(Job):
         judge: raises NoReconstructionError where the models are not what they should be.
     """
 
-    images: Images
+    images: GivenImages
     recorder: RecordingListener | None = None
     image_set: ImageSet | None = None
     features: list[Features] = field(default_factory=list)

@@ -1,0 +1,1 @@
+"""Which frames of a video are worth reconstructing, and what the frames between them tell."""
