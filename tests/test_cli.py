@@ -200,7 +200,7 @@ def test_a_bug_is_1_in_one_line(
     def bug(*_: object, **__: object) -> None:
         raise ValueError("two\nlines")
 
-    monkeypatch.setattr("sfmapp.pipelines.sparse.reconstruct.load_images", bug)
+    monkeypatch.setattr("sfmapp.pipelines.sparse.videos.load_images", bug)
     line = ["reconstruct", str(tmp_path), "-o", str(tmp_path / "out")]
     assert main(line) == 1
     said = capsys.readouterr().err

@@ -14,6 +14,7 @@ from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
 from sfmapp.report.plan import PlanCheck
 from sfmapp.report.top_view import top_view_svg
+from sfmapp.report.video_html import videos_section
 from sfmapp.report.world_map import world_section
 from sfmapp.reporting import NamedReason
 
@@ -58,14 +59,15 @@ def _starts(report: ReconstructionReport) -> str:
 
 
 def render_html(
-    report: ReconstructionReport, model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = ()
-) -> str:
+    report: ReconstructionReport, model: Reconstruction | None, dense_pictures: Sequence[PictureRow] = (),
+    frames: Mapping[str, str] | None = None,
+) -> str:  # fmt: skip
     """The page of a report.
 
     Args:
         report: of the run.
         model: the largest model, for a view from above.
-        dense_pictures: of the patches.
+        dense_pictures: of the patches. frames: URLs of small pictures of frames of videos, by name.
     """
     body = [_headline(report), failure_box(report.outcome), check_table(report.checks)]
     if model is not None:
@@ -73,6 +75,8 @@ def render_html(
         new = len(report.added.photographs) if report.added is not None else 0
         view = top_view_svg(model, _orientation(report, model), new=new)
         body.append(f'<h2>From above</h2>{view}<p class="dim">{note}</p>')
+    if report.stages.videos:
+        body.append(videos_section(report.stages.videos, frames or {}))
     if report.added is not None:
         body.append(added_section(report.added))
     if report.merged is not None and not report.outcome.exit_code:

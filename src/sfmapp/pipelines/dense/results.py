@@ -20,6 +20,7 @@ from sfmapp.dense.scene import DenseScene, Patches
 from sfmapp.errors import InputError
 from sfmapp.formats.colmap import read_model
 from sfmapp.pipelines.dense.source import DenseJob
+from sfmapp.pipelines.sparse.videos import strips
 from sfmapp.report.dense_document import dense_document
 from sfmapp.report.dense_html import render_dense_html
 from sfmapp.report.dense_pictures import PictureRow, dense_pictures
@@ -269,7 +270,8 @@ def _write_report(
     if isinstance(document, DenseRunReport):
         workspace.write_text(PAGE, render_dense_html(document, pictures))
     else:
-        workspace.write_text(PAGE, render_html(document, read_model(job.known.model)[0], pictures))
+        frames = strips(workspace.folder, document.stages.videos)
+        workspace.write_text(PAGE, render_html(document, read_model(job.known.model)[0], pictures, frames))
 
 
 def _with(stages: Stages, section: DenseReport | MeshRunReport | FailedReport) -> Stages:

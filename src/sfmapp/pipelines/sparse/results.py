@@ -15,6 +15,7 @@ from sfmapp.geometry.orientation import MIRRORED
 from sfmapp.georeference.world_frame import GEOREFERENCE, write_georeference
 from sfmapp.mapping.report import MappingReport, ModelEntry, Uncertainty
 from sfmapp.pipelines.sparse.planned import held_against_plan
+from sfmapp.pipelines.sparse.videos import strips
 from sfmapp.pipelines.stored_pixels import STORED, noted_orientations
 from sfmapp.report.document import (
     FORMAT,
@@ -84,7 +85,7 @@ def write_results(
         report = replace(report, added=run.added(models))
     plan = held_against_plan(keys, run.options, run.stages, run.usage, report.run)
     report = replace(report, merged=run.merged, plan=plan)
-    page = render_html(report, models[0] if models else None)
+    page = render_html(report, models[0] if models else None, frames=strips(workspace.folder, run.stages.videos))
     run.save_first(lambda: workspace.write_text(PAGE, page))
     took = run.watch.read()  # the last measurement that can still be written down
     report = replace(report, run=replace(report.run, **took))

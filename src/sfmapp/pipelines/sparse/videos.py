@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,10 +13,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.images.folder import load_found
+from sfmapp.images.headers import UnusableImage, read_header
 from sfmapp.images.load import GivenImages, Images, load_images
+from sfmapp.images.pixels import decode_bytes
 from sfmapp.images.sources import Found, find_files, find_images, printable
 from sfmapp.images.video import is_stream, is_video
 from sfmapp.pipelines.sparse.photographs import link_photographs
+from sfmapp.report.drawing import jpeg_url
+from sfmapp.report.video_html import frames_of_strip
 from sfmapp.reporting import from_plain, to_json
 from sfmapp.video.frames import STAGE, choose_frames
 from sfmapp.video.options import VideoOptions
@@ -34,6 +39,7 @@ IMAGES = "images"
 # What was chosen of a video, and with which key.
 _CHOSEN = ".video.json"
 _ENTRIES = ("sfmapp.video.frames",)
+_THUMBNAIL_PX = 150
 
 
 class Sources(NamedTuple):
@@ -121,6 +127,19 @@ def _frames_of(video: Path, folder: Path, options: VideoOptions, events: Events)
     report = replace(choose_frames(video, folder, options, events), key=key)
     (folder / _CHOSEN).write_text(to_json(report, indent=1) + "\n", encoding="utf-8")
     return report
+
+
+def strips(folder: Path, videos: Sequence[VideoReport] | None) -> dict[str, str]:
+    """URLs of small pictures of frames of videos that the page of a workspace shows, by name."""
+    root = folder / IMAGES
+    urls = {}
+    for name in (name for report in videos or () for name in frames_of_strip(report)):
+        with suppress(OSError, UnusableImage):
+            data = (root / name).read_bytes()
+            pixels = decode_bytes(data, read_header(data))
+            if pixels is not None:
+                urls[name] = jpeg_url(pixels, _THUMBNAIL_PX)
+    return urls
 
 
 # -------------------------------------------------------------------------------------------------------------- names
