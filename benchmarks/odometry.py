@@ -55,7 +55,14 @@ from sfmapp.sequences.open import SequenceOptions, open_sequence
 
 DATA = Path(os.environ.get("SFMAPP_DATA", ROOT.parent / "shared" / "data"))
 # one of each kind, as render_sequences.py lays them out
-RENDERED = (("street", ()), ("street", ("--mono",)), ("hall", ()), ("hall", ("--mono",)), ("room", ()))
+RENDERED = (
+    ("street", ()),
+    ("street", ("--mono",)),
+    ("hall", ()),
+    ("hall", ("--mono",)),
+    ("room", ()),
+    ("handheld", ()),
+)
 # what a run with the same seed has to write again byte for byte; other files hold times
 REPEATABLE = ("trajectory*.tum", "trajectory.kitti*", "covariance.csv", "sparse/*/*.bin")
 

@@ -83,6 +83,7 @@ def main() -> None:
     parser.add_argument("sequence", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--mono", action="store_true")
+    parser.add_argument("--slow", type=float, default=1.0, help="times that of the sequence: beside busy neighbours")
     args = parser.parse_args()
     words = vocabulary()
     if words is None:
@@ -98,7 +99,7 @@ def main() -> None:
     begin, first = time.perf_counter(), None
     for frame in sequence.frames():
         first = frame.timestamp_s if first is None else first
-        wait = frame.timestamp_s - first - (time.perf_counter() - begin)
+        wait = args.slow * (frame.timestamp_s - first) - (time.perf_counter() - begin)
         if wait > 0:
             time.sleep(wait)
         track = slam.track_stereo if sequence.rig.is_stereo else slam.track_monocular

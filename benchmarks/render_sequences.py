@@ -31,7 +31,7 @@ from sfmapp.geometry import rigid3
 
 Array = NDArray[np.float64]
 
-LAYOUTS = {"street": "kitti", "hall": "euroc", "room": "tum"}
+LAYOUTS = {"street": "kitti", "hall": "euroc", "room": "tum", "handheld": "tum"}
 EUROC_START_NS = 1403636579763555584
 TUM_START_S = 1305031910.765238
 
@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--mono", action="store_true", help="the first camera alone")
     parser.add_argument("--noise", type=float, help="standard deviation in grey levels")
     parser.add_argument("--blur", type=float, help="exposure in seconds; 0: no motion blur")
+    parser.add_argument("--readout", type=float, help="seconds from the first row to the last; 0: a global shutter")
     parser.add_argument("--moving-cars", type=int, default=0, help="street: cars that come the other way")
     parser.add_argument("--threads", type=int, default=2)
     edit = {"action": "append", "dest": "edits", "metavar": "AT:COUNT"}
@@ -83,6 +84,8 @@ def make(args: argparse.Namespace) -> RenderedSequence:
         optics = replace(optics, noise_sigma=args.noise)
     if args.blur is not None:
         optics = replace(optics, exposure_s=args.blur, sub_exposures=16 if args.blur > 0 else 1)
+    if args.readout is not None:
+        optics = replace(optics, readout_s=args.readout)
     if args.mono:
         rig = replace(sequence.rig, cameras=sequence.rig.cameras[:1], cam_from_rig=sequence.rig.cam_from_rig[:1])
         sequence = replace(sequence, rig=rig)

@@ -243,6 +243,19 @@ def test_motion_blur_is_the_mean_over_the_exposure() -> None:
     assert np.abs(many[1] - twice).max() > 6
 
 
+def test_rows_of_a_rolling_shutter_are_taken_one_after_the_other() -> None:
+    world, _ = dots_on_wall()
+    renderer, motion = Renderer(world, PINHOLE), np.array([0.1, 0.6, 0.2, 0.0, 0.5, 0.0])
+    pose = looking((4.0, 0.0, 0.0), 3.0)
+    rolled = renderer.photograph(pose, replace(QUIET, readout_s=0.1), [0], motion=motion)
+    for first in (0, 56, 112):  # bands of eight rows; at their borders edges are not known, and not smoothed
+        late = 0.1 * ((first + 4) / PINHOLE.height - 0.5)
+        then = renderer.photograph(moved_camera(pose, motion, late), QUIET, [0])
+        rows = slice(first + 1, first + 7)
+        np.testing.assert_array_equal(rolled[rows], then[rows])
+        assert first == 56 or (rolled[rows] != renderer.photograph(pose, QUIET, [0])[rows]).any()
+
+
 def test_a_moving_quad_moves() -> None:
     build = builder()
     build.box((5.0, 0.0, -0.5), (1, 1, 1), Skin(build.texture(smooth()), glows=True), 0.0, (0.0, 1.0, 0.0), (0.0, 3.0))

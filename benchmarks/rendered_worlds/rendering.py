@@ -31,6 +31,7 @@ NEAR_M = 0.02  # surfaces nearer than this are cut away
 MAX_PROBES = 6  # samples along the footprint; beyond this ratio of its axes the texture is blurred
 MAX_LEVELS = 13
 BLUR_STEP_PX = 1.5  # a moving image is sampled this densely: less than its own sharpness
+BAND_ROWS = 8  # of a rolling shutter are taken at one time: a hundredth of a pixel at a pixel a millisecond
 EDGE_GREY = 1.5  # surfaces that differ by less than this look like one
 # eight rooks: each row and column of an 8 x 8 grid is hit once, so edges of any direction get nine levels
 ROOKS = (np.array([[0, 3], [1, 6], [2, 0], [3, 5], [4, 2], [5, 7], [6, 1], [7, 4]]) + 0.5) / 8 - 0.5
@@ -124,6 +125,7 @@ class Optics:
     exposure_s: float = 0.0  # how long the shutter is open; motion blurs over this time
     sub_exposures: int = 1  # most images averaged over the exposure; fewer where less moves. 1: no blur
     edge_samples: bool = True  # eight rays a pixel where surfaces meet; False: one ray everywhere
+    readout_s: float = 0.0  # from the first row to the last: a rolling shutter, which opens row by row. 0: global
 
 
 @dataclass(frozen=True)
@@ -144,16 +146,19 @@ class View:
 class Renderer:
     """Renders a world through one camera; the lens is inverted once. May be used by several threads at a time."""
 
-    def __init__(self, world: World, camera: Camera) -> None:
+    def __init__(self, world: World, camera: Camera, rows: tuple[int, int] | None = None) -> None:
+        """rows: the first and the one after the last that are rendered; None: all."""
         self.world = world
         self.camera = camera
+        self.rows = (0, camera.height) if rows is None else rows
 
     @cached_property
     def _rays(self) -> tuple[Array, Array, Array, Array]:
         """(H, W, 2) normalised image points of the pixel centres, (H, W, 4) their derivative by the pixel, (R, C, 4)
         bounds x0, x1, y0, y1 of the tiles, (4, max(R, C)) bounds of the tiles' columns and rows."""
-        width, height = self.camera.width, self.camera.height
-        x, y = np.meshgrid(np.arange(-1, width + 1) + 0.5, np.arange(-1, height + 1) + 0.5)
+        width, (first, last) = self.camera.width, self.rows
+        height = last - first
+        x, y = np.meshgrid(np.arange(-1, width + 1) + 0.5, np.arange(first - 1, last + 1) + 0.5)
         rays = pixels_to_normalized(self.camera, np.stack([x.ravel(), y.ravel()], 1)).reshape(*x.shape, 2)
         if not np.isfinite(rays).all():
             raise ValueError("the lens has no inverse in a corner of the image")
@@ -225,29 +230,53 @@ class Renderer:
         """An (H, W) uint8 image as a camera would deliver it.
 
         Args:
-            cam_from_world: (7,) pose at the middle of the exposure.
+            cam_from_world: (7,) pose at the middle of the exposure, of a rolling shutter that of the middle row.
             optics: noise, vignetting, blur.
             key: the noise is drawn from these integers.
             gain: exposure, a factor on the grey values before the noise.
             motion: (6,) angular velocity in the camera's frame (rad/s) and velocity of its centre in the world (m/s);
-                needed for motion blur.
+                needed for motion blur and a rolling shutter.
         """
-        view = self.view(cam_from_world, time_s, edge_samples=optics.edge_samples)
-        grey = view.grey
         moving = np.zeros(6) if motion is None else np.asarray(motion, np.float64)
-        count = min(optics.sub_exposures, self._blur_steps(view.depth, moving, optics.exposure_s))
-        if count > 1:
-            grey = np.zeros_like(grey)
-            for k in range(count):
-                shift_s = ((k + 0.5) / count - 0.5) * optics.exposure_s
-                pose = moved_camera(cam_from_world, moving, shift_s)
-                grey += self.view(pose, time_s + shift_s, edge_samples=optics.edge_samples).grey / np.float32(count)
+        if optics.readout_s:
+            grey = np.concatenate([
+                band._exposed(moved_camera(cam_from_world, moving, late), optics, time_s + late, moving)
+                for band, late in zip(self._bands, self._lateness(optics.readout_s), strict=True)
+            ])  # fmt: skip
+        else:
+            grey = self._exposed(cam_from_world, optics, time_s, moving)
         grey *= self._vignette(optics.vignetting) * np.float32(gain)
         if optics.noise_sigma > 0:
             rng = np.random.default_rng([*key, 0x2E17DE2])
             grey += np.float32(optics.noise_sigma) * rng.standard_normal(grey.shape, np.float32)
         image: NDArray[np.uint8] = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
         return image
+
+    @cached_property
+    def _bands(self) -> list[Renderer]:
+        """The image in rows that are taken at one time."""
+        height = self.camera.height
+        return [
+            Renderer(self.world, self.camera, (row, min(row + BAND_ROWS, height)))
+            for row in range(0, height, BAND_ROWS)
+        ]
+
+    def _lateness(self, readout_s: float) -> list[float]:
+        """Seconds of the middle of each band after that of the image."""
+        return [(sum(band.rows) / (2 * self.camera.height) - 0.5) * readout_s for band in self._bands]
+
+    def _exposed(self, cam_from_world: ArrayLike, optics: Optics, time_s: float, moving: Array) -> NDArray[np.float32]:
+        """Grey values with the blur of a motion (6,)."""
+        view = self.view(cam_from_world, time_s, edge_samples=optics.edge_samples)
+        count = min(optics.sub_exposures, self._blur_steps(view.depth, moving, optics.exposure_s))
+        if count == 1:
+            return view.grey
+        grey = np.zeros_like(view.grey)
+        for k in range(count):
+            shift_s = ((k + 0.5) / count - 0.5) * optics.exposure_s
+            pose = moved_camera(cam_from_world, moving, shift_s)
+            grey += self.view(pose, time_s + shift_s, edge_samples=optics.edge_samples).grey / np.float32(count)
+        return grey
 
     def _blur_steps(self, depth: NDArray[np.float32], motion: Array, exposure_s: float) -> int:
         """How many images make a blur without ghosts: all but the nearest tenth moves by less than a step between."""

@@ -173,6 +173,38 @@ def room(
     )  # fmt: skip
 
 
+def handheld(
+    num_frames: int = 1000, seed: int = 0, optics: Optics | None = None, camera: Camera | None = None
+) -> RenderedSequence:
+    """Somebody films a part of a furnished room on the spot, 640x480 at 30 frames a second, like 7-Scenes (Shotton et
+    al., CVPR 2013): a cheap sensor with a rolling shutter, blur, noise and a wandering exposure.
+
+    The camera stays within 1.5 x 1.5 m, looks to one side of the room and turns to and fro, at 20 degrees a second in
+    the median and up to some 100; what it saw it sees again and again.
+    """
+    rng = np.random.default_rng([seed, 0x75CE])
+    if camera is None:
+        camera = Camera(CameraModel.PINHOLE, 640, 480, np.array([525.0, 525.0, 320.0, 240.0]))
+    times = np.arange(num_frames) / 30.0
+    duration, step, degree = times[-1] + 1.0, 0.75, np.pi / 180
+    count = int(np.ceil(duration / step)) + DEGREE + 1
+    # standing behind the middle of the room, looking across it
+    side = rng.uniform(0, 2 * np.pi)
+    stand = np.array([-0.7 * np.cos(side), -0.9 * np.sin(side), 1.45, side, 14 * degree, 0.0])
+    reach = np.array([0.75, 0.75, 0.3, 80 * degree, 16 * degree, 9 * degree])
+    body = Motion((
+        control_spline(stand + reach * rng.uniform(-1, 1, (count, 6)), step),
+        tremor(rng, duration, 0.45, [0.012, 0.012, 0.01, 1.0 * degree, 1.0 * degree, 0.8 * degree]),
+        tremor(rng, duration, 0.12, [0.002, 0.002, 0.002, 0.15 * degree, 0.15 * degree, 0.1 * degree]),
+    ))  # fmt: skip
+    gain = _wandering_gain(rng, times, 0.9, 0.12, 1.1)
+    return _sequence(
+        "handheld", room_world(seed), Rig.single(camera), times,
+        lambda t: rigid3.compose(CAM_FROM_BODY, body.body_from_world(t)), gain,
+        optics or Optics(noise_sigma=3.0, vignetting=0.3, exposure_s=0.012, sub_exposures=4, readout_s=0.02), seed,
+    )  # fmt: skip
+
+
 def hall_rig() -> Rig:
     """Two cameras with barrel lenses, 11 cm apart and turned by more than half a degree against each other."""
     left = Camera(CameraModel.OPENCV, 752, 480, np.array([458.6, 457.3, 367.7, 248.9, -0.283, 0.0739, 1.9e-4, 1.8e-5]))

@@ -131,7 +131,7 @@ def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: i
     for record in records:
         if record.map_idx != map_idx or not record.has_pose:
             continue
-        if last is not None and record.is_twin and record.xy is last.xy and record.keyframe == last.keyframe:
+        if last is not None and shows_the_same(record, last):
             record.measure(last.covariance, last.frame_from_keyframe)
             continue
         last = record
@@ -146,6 +146,11 @@ def measure_again(records: list[FrameRecord], keyframes: KeyframeMap, map_idx: i
         if measured is None:
             continue
         record.measure(measured[1], rigid3.compose(measured[0], rigid3.inverse(keyframe.rig_from_world)))
+
+
+def shows_the_same(record: FrameRecord, before: FrameRecord) -> bool:
+    """Whether a frame is the twin of the one before it, and saw what that one saw."""
+    return record.is_twin and record.xy is before.xy and record.keyframe == before.keyframe
 
 
 def gather(

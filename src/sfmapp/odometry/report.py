@@ -304,6 +304,7 @@ class AdjustmentReport(Report):
         is_piecewise: the map is too large to be adjusted at once.
         inertial: measurements of a sensor that took part, or why they did not; absent without one.
         plane: that of a camera on wheels; absent where the motion is free and does not look like one.
+        num_frames: frames between the keyframes that were adjusted with them in the end; absent where none were.
     """
 
     camera: CalibrationCheck
@@ -313,6 +314,7 @@ class AdjustmentReport(Report):
     is_piecewise: bool | None = None
     inertial: ScaleEvidence | None = None
     plane: PlaneEvidence | None = None
+    num_frames: int | None = None
 
 
 # ------------------------------------------------------------------------------------------- the unit of length

@@ -16,6 +16,7 @@ from sfmapp.camera.camera import project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Frame, Sequence
+from sfmapp.odometry.frames_adjustment import adjust_frames
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks
 from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
 from sfmapp.odometry.frontend.twins import is_twin
@@ -530,8 +531,10 @@ class Odometry:
             maps[number] = local.keyframes
             conclusion.contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusion.contradictions.extend(local.witnesses.contradictions(local.keyframes))
-            conclusions[number] = replace(conclusion, report=replace(conclusion.report, shutter=straightened))
             measure_again(self.records, local.keyframes, number)
+            num_frames = None if is_known else self._adjust_frames(local, conclusion)
+            report = replace(conclusion.report, shutter=straightened, num_frames=num_frames)
+            conclusions[number] = replace(conclusion, report=report)
             self.events.finished("adjustment", **conclusions[number].report)
         if self.executor is not None:
             self.executor.shutdown()
@@ -568,6 +571,18 @@ class Odometry:
         self.known.lay_onto(local.keyframes, together)
         conclusion.contradictions.append(found)
         return conclusion
+
+    def _adjust_frames(self, local: LocalMap, conclusion: FinalAdjustment) -> int | None:
+        """Adjust the frames between the keyframes with them, where images of one camera alone hold the map; how many
+        took part, None for none."""
+        by_others = self.rig.is_stereo or self.imu is not None or self.options.motion != "free"
+        if by_others or conclusion.adjustment is None:
+            return None
+        num = adjust_frames(self.records, local.keyframes, local.map_idx, self.events)
+        if num:
+            message = f"the {num} frames between the keyframes are adjusted with them"
+            self.events.decided("adjustment", message, num_frames=num)
+        return num or None
 
     def _straighten(self, local: LocalMap) -> ShutterReport | None:
         """Undo a rolling shutter where the images clearly show one; the numbers behind that, None where it was not
