@@ -10,10 +10,12 @@ take hours.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from rendered_worlds.rendering import Renderer, World
 from rendered_worlds.towns import Walk, camera
@@ -26,8 +28,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 NOISE_PX, FAR_NOISE_PX, FAR_SHARE = 0.4, 2.0, 0.05
-# Points a square metre, by their sizes in metres, and the pixels between which a size is a keypoint.
-_PER_M2, _SIZES_M, _PIXELS = 6.0, (0.03, 0.6), (2.0, 12.0)
+# Points a square metre of walls and of ground, by their sizes in metres, and the pixels that a keypoint has.
+_PER_M2, _PER_M2_GROUND, _SIZES_M, _PIXELS = 6.0, 0.8, (0.03, 0.6), (2.0, 12.0)
 # Up to which angle to its surface a point is seen, and to another view it is matched; how often it is found, matched.
 _ASLANT_DEG, _MATCHED_DEG, _FOUND, _MATCHED = 68.0, 40.0, 0.8, 0.85
 # How many others a view is compared with, and matches that verify a pair.
@@ -48,40 +50,62 @@ class Sighted:
 def sight(world: World, walk: Walk, width: int, seed: int = 0) -> Sighted:
     """Keypoints of every view."""
     rng = np.random.default_rng([seed, 0x70E6])
-    xyz, quad, normal, size = _points(world, walk, rng)
     lens, coarse = camera(width), camera(_COARSE_PX)
-    renderer = Renderer(world, coarse)
+    points = _points(world, walk, rng)
+    near, renderer = _Near(points, lens), Renderer(world, coarse)
     found = Sighted([], [], [])
     for pose in walk.cam_from_world:
         center = rigid3.center(pose)
-        near = np.flatnonzero(np.linalg.norm(xyz - center, axis=1) < _FAR_M)
-        ray = xyz[near] - center
+        chosen = near.of(center)
+        chosen = chosen[rng.random(len(chosen)) < _FOUND]
+        ray = points.xyz[chosen] - center
         distance = np.linalg.norm(ray, axis=1)
         ray /= distance[:, None]
-        pixels = size[near] * lens.focal / distance
-        cosine = -(ray * normal[near]).sum(1)
-        seen = (cosine > np.cos(np.radians(_ASLANT_DEG))) & (pixels > _PIXELS[0]) & (pixels < _PIXELS[1])
-        seen &= rng.random(len(near)) < _FOUND
-        near, ray = near[seen], ray[seen]
-        in_camera = rigid3.apply(pose, xyz[near])
-        front = in_camera[:, 2] > 0.2
-        near, ray, in_camera = near[front], ray[front], in_camera[front]
-        pixel = project(lens, in_camera)
+        cosine = -(ray * points.normal[chosen]).sum(1)
+        in_camera = rigid3.apply(pose, points.xyz[chosen])
+        seen = (cosine > np.cos(np.radians(_ASLANT_DEG))) & (points.size[chosen] * lens.focal < _PIXELS[1] * distance)
+        seen = np.flatnonzero(seen & (in_camera[:, 2] > 0.2))
+        pixel = project(lens, in_camera[seen])
         inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
-        near, ray, pixel, depth = near[inside], ray[inside], pixel[inside], in_camera[inside, 2]
+        seen, pixel = seen[inside], pixel[inside]
         view = renderer.view(pose, edge_samples=False)
         column, row = (pixel * (_COARSE_PX / width)).astype(np.int64).T
-        shown = (view.surface[row, column] == quad[near]) | (np.abs(view.depth[row, column] / depth - 1.0) < 0.02)
-        near, ray, pixel = near[shown], ray[shown], pixel[shown]
-        sigma = np.where(rng.random(len(near)) < FAR_SHARE, FAR_NOISE_PX, NOISE_PX)
+        shown = view.surface[row, column] == points.quad[chosen[seen]]
+        shown |= np.abs(view.depth[row, column] / in_camera[seen, 2] - 1.0) < 0.02
+        seen, pixel = seen[shown], pixel[shown]
+        sigma = np.where(rng.random(len(seen)) < FAR_SHARE, FAR_NOISE_PX, NOISE_PX)
         found.keypoints.append(pixel + sigma[:, None] * rng.standard_normal(pixel.shape))
-        found.points.append(near)
-        found.rays.append(ray)
+        found.points.append(chosen[seen])
+        found.rays.append(ray[seen])
     return found
 
 
-def _points(world: World, walk: Walk, rng: np.random.Generator) -> tuple[Array, Ints, Array, Array]:
-    """Places (N, 3), rectangles (N,), normals (N, 3) and sizes (N,) of points around a walk."""
+class _Points(NamedTuple):
+    """Places (N, 3), rectangles (N,), normals (N, 3) and sizes (N,) in metres."""
+
+    xyz: Array
+    quad: Ints
+    normal: Array
+    size: Array
+
+
+class _Near:
+    """Finds the points that are near enough to be seen, which small ones have to be nearer for."""
+
+    def __init__(self, points: _Points, lens: Camera) -> None:
+        reach = np.minimum(points.size * lens.focal / _PIXELS[0], _FAR_M)
+        kind = np.ceil(4.0 * np.log2(reach)).astype(np.int64)
+        members = [np.flatnonzero(kind == k) for k in np.unique(kind)]
+        self._kinds = [(own, cKDTree(points.xyz[own]), reach[own]) for own in members]
+
+    def of(self, center: Array) -> Ints:
+        """(K,) positions of the points."""
+        found = [own[tree.query_ball_point(center, reach.max())] for own, tree, reach in self._kinds]
+        return np.sort(np.concatenate(found))
+
+
+def _points(world: World, walk: Walk, rng: np.random.Generator) -> _Points:
+    """Points around a walk."""
     centers = rigid3.center(walk.cam_from_world)
     low, high = centers.min(0) - _FAR_M, centers.max(0) + _FAR_M
     cross = np.cross(world.edges[:, 1], world.edges[:, 0])
@@ -92,17 +116,13 @@ def _points(world: World, walk: Walk, rng: np.random.Generator) -> tuple[Array, 
     quad = np.repeat(np.arange(len(area)), counts)
     along = rng.random((len(quad), 2))
     xyz = world.origin[quad] + np.einsum("nk,nkj->nj", along, world.edges[quad])
-    ground = np.column_stack(
-        [
-            rng.uniform(low[:2], high[:2], (int(0.8 * np.prod((high - low)[:2])), 2)),
-        ]
-    )
+    ground = rng.uniform(low[:2], high[:2], (int(_PER_M2_GROUND * np.prod((high - low)[:2])), 2))
     xyz = np.concatenate([xyz, np.column_stack([ground, np.zeros(len(ground))])])
     normal = np.concatenate([cross[quad] / area[quad, None], np.tile([0.0, 0.0, 1.0], (len(ground), 1))])
     quad = np.concatenate([quad, np.full(len(ground), -2)])
     # as many of each size as fit beside each other, but for a square root: small ones are not all told apart
     size = _SIZES_M[0] * (_SIZES_M[1] / _SIZES_M[0]) ** (rng.random(len(xyz)) ** 1.5)
-    return xyz, quad, normal, size
+    return _Points(xyz, quad, normal, size)
 
 
 def features_of(sighted: Sighted) -> list[Features]:

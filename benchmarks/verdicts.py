@@ -87,6 +87,7 @@ def rows_of(folder: Path) -> list[Row]:
         "sparse": sparse_rows,
         "bundle_adjustment": adjustment_rows,
         "large_adjustment": large_adjustment_rows,
+        "town": town_rows,
         "dense": dense_rows,
         "odometry": odometry_rows,
         "calibration": calibration_rows,
@@ -564,6 +565,30 @@ def large_adjustment_rows(folder: Path) -> Iterator[Row]:
             yield Row("large_adjustment", row["set"], quantity, unit, "less", ours[0][key], peer, row[key], *about)
 
 
+def town_rows(folder: Path) -> Iterator[Row]:
+    """Mapping of a rendered town, beside pycolmap's from the same database."""
+    report = read(folder, "town")
+    about = (False, report["date"][:10], report["commit"])
+
+    def size(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["part"], row["width"], row["views"]
+
+    def figures(row: dict[str, Any]) -> list[float]:
+        return [row["registered"], row["cpu_s"]["mapping"] / row["views"], row["ate_share"]]
+
+    whats = (
+        ("registered views", "count", "more"), ("CPU time of mapping, a view", "s", "less"),
+        ("rms of centres, in sizes of the walk", "share", "less"),
+    )  # fmt: skip
+    peers = {size(row): figures(row) for row in report["rows"] if row["program"] == "pycolmap"}
+    for row in report["rows"]:
+        if row["program"] == "pycolmap":
+            continue
+        case, theirs = f"{row['views']} {row['part']} of {row['width']} px", peers.get(size(row))
+        for k, (ours, what) in enumerate(zip(figures(row), whats, strict=True)):
+            yield Row("town", case, *what, ours, "pycolmap" if theirs else "", theirs[k] if theirs else None, *about)
+
+
 def dense_rows(folder: Path) -> Iterator[Row]:
     """``sfmapp dense`` against the prototype, and against published figures of PMVS2 and OpenMVS."""
     report = read(folder, "dense")
@@ -617,6 +642,26 @@ class Promise:
     held: int
     tried: int
     date: str
+
+
+def town_promises(folder: Path) -> Iterator[Promise]:
+    """What is asked of a rendered town: views registered, centres right, and none dearer than those of a small one."""
+    report = read(folder, "town")
+    date, rows = report["date"][:10], [row for row in report["rows"] if row["program"] == "sfmapp"]
+    held = [row["registered"] >= 0.98 * row["views"] for row in rows]
+    yield Promise(
+        "town", "98 % of the views of a rendered town are registered in one model", sum(held), len(rows), date
+    )
+    held = [row["ate_share"] <= 1e-3 for row in rows]
+    yield Promise(
+        "town", "centres are off by no more than 0.1 % of the size of the walk, rms", sum(held), len(rows), date
+    )
+    few = {row["part"]: row["cpu_s"]["mapping"] / row["views"] for row in rows if row["views"] == 300}
+    many = [row for row in rows if row["views"] > 300 and row["part"] in few]
+    held = [row["cpu_s"]["mapping"] / row["views"] <= 1.5 * few[row["part"]] for row in many]
+    text = "mapping of more than 300 views takes no more than 1.5 times the CPU time of a view at 300"
+    if many:
+        yield Promise("town", text, sum(held), len(held), date)
 
 
 def promises(folder: Path) -> Iterator[Promise]:
@@ -788,6 +833,7 @@ def promises(folder: Path) -> Iterator[Promise]:
     yield Promise("adding", text, sum(good), len(rows), date)
     text = "the same of how many photographs are registered"
     yield Promise("adding", text, sum(row["registered"] >= at_once(row, "registered") for row in rows), len(rows), date)
+    yield from town_promises(folder)
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])
