@@ -209,8 +209,11 @@ def test_feature_files_round_trip(tmp_path: Path) -> None:
     write_feature_file(path, features)
     found = read_feature_file(path)
     assert found.metric is features.metric
+    assert found.is_dark is None
     for name in ("keypoints", "descriptors", "rgb"):
         np.testing.assert_array_equal(getattr(found, name), getattr(features, name))
+    write_feature_file(path, replace(features, is_dark=features.rgb[:, 0] < 100))
+    np.testing.assert_array_equal(read_feature_file(path).is_dark, features.rgb[:, 0] < 100)
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(InputError, match="expected the features"):
         read_feature_file(path)

@@ -26,7 +26,7 @@ DEFAULTS = {
 
 
 def sift(gray: np.ndarray, usable: np.ndarray | None = None, **changes: float) -> tuple[np.ndarray, np.ndarray]:
-    keypoints, descriptors, _ = extract_sift(gray, usable, **(DEFAULTS | changes))  # type: ignore[arg-type]
+    keypoints, descriptors, _, _ = extract_sift(gray, usable, **(DEFAULTS | changes))  # type: ignore[arg-type]
     return keypoints, descriptors
 
 
@@ -282,6 +282,16 @@ def test_levels_looked_up_around_a_pixel_are_those_of_the_octave() -> None:
                 assert top < row < top + rows - 1
                 assert left < col < left + cols - 1
                 np.testing.assert_array_equal(found, level[top : top + rows, left : left + cols])
+
+
+def test_dark_blobs_are_told_from_bright_ones() -> None:
+    xy = np.random.default_rng(3).permutation([(30.0 + 40.0 * i, 30.0 + 40.0 * j) for i in range(5) for j in range(4)])
+    keypoints, _, is_dark, _ = extract_sift(blobs(xy, np.full(20, 4.0), (220, 180)), None, **DEFAULTS)  # type: ignore[arg-type]
+    is_blob = np.hypot(*(keypoints[:, None, :2] - xy).T).T.min(axis=1) < 0.5
+    which = np.hypot(*(keypoints[:, None, :2] - xy).T).T.argmin(axis=1)
+    is_blob &= np.abs(keypoints[:, 2] - 4.0) < 1.0
+    assert len(np.unique(which[is_blob])) == 20
+    np.testing.assert_array_equal(is_dark[is_blob], which[is_blob] % 2 == 0)
 
 
 def test_blur_is_a_plain_sum_however_rows_are_divided() -> None:

@@ -31,7 +31,9 @@ def features_of(scene: SyntheticScene, image: int, orb: bool = False) -> Feature
     keypoints = np.concatenate([xy, rng.uniform(1, 9, (len(xy), 1)), rng.uniform(-3, 3, (len(xy), 1))], 1)
     descriptors = rng.integers(0, 256, (len(xy), 32 if orb else 128), np.uint8)
     metric = DescriptorMetric.HAMMING if orb else DescriptorMetric.ROOT_SIFT
-    return Features(keypoints.astype(np.float32), descriptors, rng.integers(0, 256, (len(xy), 3), np.uint8), metric)
+    rgb = rng.integers(0, 256, (len(xy), 3), np.uint8)
+    is_dark = rng.random(len(xy)) < 0.5 if image % 2 else None
+    return Features(keypoints.astype(np.float32), descriptors, rgb, metric, is_dark)
 
 
 def filled(
@@ -335,6 +337,7 @@ REFUSALS = [
         r"expected \(4,\) columns",
     ),
     ("UPDATE sfmapp_features SET rgb = x'00' WHERE image_id = 2", "colours of image 2"),
+    ("UPDATE sfmapp_signs SET is_dark = x'00' WHERE image_id = 2", "signs of image 2"),
     ("UPDATE two_view_geometries SET rows = rows + 1", "matches of pair"),
     ("UPDATE two_view_geometries SET rows = -5", "matches of pair"),
     ("UPDATE two_view_geometries SET config = 77", "configuration"),

@@ -76,6 +76,29 @@ def test_a_search_that_is_carried_on_finds_what_one_at_once_does(n: int, m: int,
                 np.testing.assert_array_equal(array, expected)
 
 
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 150), st.integers(0, 150), st.lists(st.integers(0, 160), max_size=3), st.integers(0, 2**31))
+def test_dark_and_bright_are_searched_apart(n: int, m: int, sizes: list[int], seed: int) -> None:
+    """Against all products at once, in which those of a dark and a bright one count for nothing."""
+    rng = np.random.default_rng(seed)
+    a, b = random_sift(n, rng), random_sift(m, rng)
+    is_dark1, is_dark2 = rng.random(n) < rng.random(), rng.random(m) < rng.random()
+    search = ProductSearch(a, b, is_dark1, is_dark2)
+    for size in sorted(sizes):
+        rows, columns = search.among_first(size)
+        assert rows.partner.max(initial=-1) < len(columns.first)
+        assert columns.partner.max(initial=-1) < len(rows.first)
+    products = a.astype(np.int64) @ b.astype(np.int64).T * (is_dark1[:, None] == is_dark2)
+    for found, each in zip(search.among_first(160), (products, products.T), strict=True):
+        wanted = np.sort(np.hstack([np.zeros((len(each), 2), np.int64), each]), axis=1)[:, :-3:-1]
+        num = len(found.first)  # what comes after is compared with nothing
+        np.testing.assert_array_equal(wanted[num:], 0)
+        np.testing.assert_array_equal(np.column_stack([found.first, found.second]), wanted[:num])
+        has_one = found.partner >= 0
+        np.testing.assert_array_equal(has_one, found.first > 0)
+        np.testing.assert_array_equal(each[:num][has_one, found.partner[has_one]], found.first[has_one])
+
+
 def test_matches_are_mutual_and_pass_the_ratio_from_both_sides() -> None:
     rng = np.random.default_rng(1)
     a = random_sift(400, rng)
@@ -125,6 +148,11 @@ def test_background_leaves_the_neighbourhood_out() -> None:
     is_far = np.linalg.norm(xy[:, None] - xy[sample], axis=2) > radius[:, None]
     np.testing.assert_array_equal(
         background_products(descriptors, xy, radius, 50), np.where(is_far, products, 0).max(1)
+    )
+    is_dark = rng.random(90) < 0.4
+    is_far &= is_dark[:, None] == is_dark[sample]
+    np.testing.assert_array_equal(
+        background_products(descriptors, xy, radius, 50, is_dark), np.where(is_far, products, 0).max(1)
     )
 
 

@@ -192,9 +192,9 @@ def features_from_picture(
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         if usable is not None:
             usable = cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) != 0
-    threshold: float | None = None
+    threshold, is_dark = None, None
     if options.kind == "sift":
-        keypoints, descriptors, threshold = extract_sift(
+        keypoints, descriptors, is_dark, threshold = extract_sift(
             gray,
             usable,
             max_num_features=options.max_num_features,
@@ -212,7 +212,8 @@ def features_from_picture(
         keypoints[:, 2] *= factor.mean()
     x = np.clip(keypoints[:, 0].astype(np.int64), 0, width - 1)
     y = np.clip(keypoints[:, 1].astype(np.int64), 0, height - 1)
-    return Features(keypoints, descriptors, picture.rgb[y, x], _METRICS[options.kind]), scale, threshold
+    found = Features(keypoints, descriptors, picture.rgb[y, x], _METRICS[options.kind], is_dark)
+    return found, scale, threshold
 
 
 def empty_features(kind: str) -> Features:

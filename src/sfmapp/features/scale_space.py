@@ -278,7 +278,7 @@ def _locate(
     Args:
         d: (3, 3, 3) differences by layer, row, column; p: (3, 3), working memory.
         ds: scale in layers from the middle one.
-        out: filled with column and row from the middle one, and at 3 with the absolute height.
+        out: filled with column and row from the middle one, at 3 with the absolute height, and at 4 with its sign.
 
     Returns:
         Whether it is a summit, within a pixel, and not on an edge.
@@ -294,7 +294,9 @@ def _locate(
     if det <= 0.0 or trace * trace * edge_threshold >= (edge_threshold + 1.0) ** 2 * det:
         return False
     dx, dy = (xy * gy - yy * gx) / det, (xy * gx - xx * gy) / det
-    out[0], out[1], out[3] = dx, dy, abs(p[1, 1] + 0.5 * (gx * dx + gy * dy))
+    height = p[1, 1] + 0.5 * (gx * dx + gy * dy)
+    # more blur makes the middle of what is dark brighter
+    out[0], out[1], out[3], out[4] = dx, dy, abs(height), 1.0 if height > 0.0 else -1.0
     return abs(dx) < 1.0 and abs(dy) < 1.0
 
 
@@ -312,7 +314,7 @@ def refine_extremum(
             of the levels: then it can go on there with others.
         edge_threshold: largest ratio of the principal curvatures.
         d: (4, 3, 3), working memory.
-        out: (4,) float64, filled with column, row, layer (all with fractions) and absolute difference there.
+        out: (5,) float64, filled with column, row, layer (all with fractions), absolute difference there and its sign.
 
     Returns:
         Whether the fit settled and the place does not lie on an edge.
@@ -373,7 +375,7 @@ def refine_all(
     levels: tuple[Floats, ...], origin: tuple[int, int], shape: tuple[int, int], place: NDArray[np.int32],
     edge_threshold: float, out: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """:func:`refine_extremum` of every place (N, 4); rows of out (N, 4) that fail become NaN."""
+    """:func:`refine_extremum` of every place (N, 4); rows of out (N, 5) that fail become NaN."""
     d = np.empty((4, 3, 3))
     for n in range(place.shape[0]):
         if not refine_extremum(levels, origin, shape, place[n], edge_threshold, d, out[n]):

@@ -41,7 +41,7 @@ def extract_sift(
     contrast_threshold: float,
     edge_threshold: float,
     scratch: Scratch | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], float]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.bool_], float]:
     """Detect and describe.
 
     Args:
@@ -55,11 +55,12 @@ def extract_sift(
 
     Returns:
         (N, 4) float32 x, y in COLMAP's pixels, scale in pixels, orientation in radians from x towards y (which points
-        down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; the contrast threshold in use.
+        down), largest scale first; (N, 128) uint8 descriptors as COLMAP stores them; (N,) whether each is darker than
+        what lies around it; the contrast threshold in use.
     """
     threshold = _threshold(gray, contrast_threshold)
     octaves, places = _detect(gray, threshold, edge_threshold, max_num_features, scratch or Scratch())
-    found = np.concatenate([*places, np.zeros((0, 4))])
+    found = np.concatenate([*places, np.zeros((0, 5))])
     xy = np.concatenate([octave.xy(place) for octave, place in zip(octaves, places, strict=True)] + [np.zeros((0, 2))])
     chosen = np.sort(_choose(xy, found[:, 3], gray.shape, usable, max_num_features))
     octave_idx = np.repeat(np.arange(len(octaves)), [len(place) for place in places])[chosen]
@@ -77,7 +78,7 @@ def extract_sift(
     scale *= np.array([octave.step for octave in octaves])[octave_idx[place]] if len(place) else 1.0
     order = np.lexsort((angle, xy[place, 1], xy[place, 0], -scale))
     keypoints = np.column_stack([xy[place], scale, angle])[order].astype(np.float32)
-    return keypoints, vector[order], threshold
+    return keypoints, vector[order], found[place[order], 4] > 0.0, threshold
 
 
 def _threshold(gray: NDArray[np.uint8], contrast_threshold: float) -> float:
@@ -109,10 +110,10 @@ def _detect(
 def _find(
     octave: Octave, coarser: Octave, threshold: float, edge_threshold: float, max_refined: int
 ) -> NDArray[np.float64]:
-    """(N, 4) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels);
-    fills level 0 of the next one."""
+    """(N, 5) keypoints of an octave from top to bottom: column, row, layer, contrast (threshold, too: grey levels), and
+    1 for dark ones, -1 for bright ones; fills level 0 of the next one."""
     strongest, cut = np.zeros(0, np.float32), np.float32(0.0)
-    found, place, value = [np.zeros((0, 4))], [np.zeros((0, 4), np.int32)], [np.zeros(0, np.float32)]
+    found, place, value = [np.zeros((0, 5))], [np.zeros((0, 4), np.int32)], [np.zeros(0, np.float32)]
     # the parabola raises the contrast above that of the pixel, so those a little below get their chance
     for window, its_place, its_value in _search(octave, coarser, 0.8 * threshold):
         strongest = np.concatenate([strongest, its_value])
@@ -122,7 +123,7 @@ def _find(
         # what is too weak already will be so in the end
         place.append(its_place[its_value >= cut])
         value.append(its_value[its_value >= cut])
-        found.append(np.empty((len(place[-1]), 4)))
+        found.append(np.empty((len(place[-1]), 5)))
         scale_space.refine_all(window.levels, window.origin, octave.shape, place[-1], edge_threshold, found[-1])
     is_strong = np.concatenate(value) >= cut
     places, keypoints = np.concatenate(place)[is_strong], np.concatenate(found)[is_strong]

@@ -1,8 +1,9 @@
 """Features and matches in COLMAP 4.2's SQLite schema: COLMAP's own tools open what we write, and we what they write.
 
-Three tables of ours stand beside COLMAP's, which ignores them: ``sfmapp_features`` holds the colour under each
+Four tables of ours stand beside COLMAP's, which ignores them: ``sfmapp_features`` holds the colour under each
 keypoint, ``sfmapp_pairs`` the counts of verification, and both the key under which a row was computed, for resuming;
-``sfmapp_descriptors`` holds the metric of descriptors that are not SIFT's.
+``sfmapp_descriptors`` holds the metric of descriptors that are not SIFT's, ``sfmapp_signs`` which keypoints are dark,
+where that is known.
 
 COLMAP's table of descriptors holds bytes. Floats stand in it as COLMAP writes those of ALIKED and LOMA: the bytes of
 little-endian float32, four columns each.
@@ -124,12 +125,13 @@ _OWN_SCHEMA = """
 CREATE TABLE IF NOT EXISTS sfmapp_features (
     image_id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL, rgb BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS sfmapp_descriptors (image_id INTEGER PRIMARY KEY NOT NULL, metric TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS sfmapp_signs (image_id INTEGER PRIMARY KEY NOT NULL, is_dark BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS sfmapp_pairs (
     pair_id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL, num_putative INTEGER NOT NULL,
     num_inliers_f INTEGER NOT NULL, num_inliers_e INTEGER NOT NULL, num_inliers_h INTEGER NOT NULL,
     median_angle_deg REAL);
 """
-_IMAGE_TABLES = ("keypoints", "descriptors", "sfmapp_features", "sfmapp_descriptors")
+_IMAGE_TABLES = ("keypoints", "descriptors", "sfmapp_features", "sfmapp_descriptors", "sfmapp_signs")
 _PAIR_TABLES = ("matches", "two_view_geometries", "sfmapp_pairs")
 
 
@@ -363,6 +365,9 @@ class Database:
             db.execute("DELETE FROM sfmapp_descriptors WHERE image_id = ?", (image_id,))
             if not is_sift:
                 db.execute("INSERT INTO sfmapp_descriptors VALUES (?, ?)", (image_id, str(metric)))
+            db.execute("DELETE FROM sfmapp_signs WHERE image_id = ?", (image_id,))
+            if features.is_dark is not None:
+                db.execute("INSERT INTO sfmapp_signs VALUES (?, ?)", (image_id, _blob(features.is_dark, "u1")))
             db.execute(
                 "INSERT OR REPLACE INTO sfmapp_features VALUES (?, ?, ?)", (image_id, key, _blob(features.rgb, "u1"))
             )
@@ -388,6 +393,7 @@ class Database:
             descriptor_row = self._one("descriptors", "image_id", f"{self._type_column}, rows, cols, data", image_id)
             metric_row = self._one("sfmapp_descriptors", "image_id", "metric", image_id)
             rgb_row = self._one("sfmapp_features", "image_id", "rgb", image_id)
+            sign_row = self._one("sfmapp_signs", "image_id", "is_dark", image_id)
         if keypoint_row is None or descriptor_row is None:
             raise InputError(f"{self.path}: expected keypoints and descriptors of {what}, found none")
         keypoints = _scale_and_orientation(self._table(f"keypoints of {what}", "<f4", (2, 4, 6), *keypoint_row))
@@ -402,7 +408,10 @@ class Database:
         rgb = np.zeros((len(keypoints), 3), np.uint8)
         if rgb_row is not None:
             rgb = self._table(f"colours of {what}", "u1", (3,), len(keypoints), 3, *rgb_row)
-        return Features(keypoints, descriptors, rgb, metric)
+        is_dark = None
+        if sign_row is not None:
+            is_dark = self._table(f"signs of {what}", "u1", (1,), len(keypoints), 1, *sign_row)[:, 0] != 0
+        return Features(keypoints, descriptors, rgb, metric, is_dark)
 
     def _descriptors(
         self, what: str, metric_row: tuple[Any, ...] | None, kind: Any, rows: Any, cols: Any, data: Any

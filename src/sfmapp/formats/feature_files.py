@@ -24,11 +24,14 @@ def write_feature_file(path: Path, features: Features) -> None:
     Raises:
         InputError: the folder cannot be written.
     """
+    arrays = {
+        "keypoints": features.keypoints, "descriptors": features.descriptors, "rgb": features.rgb,
+        "metric": np.array(str(features.metric)),
+    }  # fmt: skip
+    if features.is_dark is not None:
+        arrays["is_dark"] = features.is_dark
     with replaced_file(path) as beside, beside.open("wb") as file:
-        np.savez(
-            file, keypoints=features.keypoints, descriptors=features.descriptors, rgb=features.rgb,
-            metric=np.array(str(features.metric)),
-        )  # fmt: skip
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_feature_file(path: Path) -> Features:
@@ -40,7 +43,8 @@ def read_feature_file(path: Path) -> Features:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return Features(
-                arrays["keypoints"], arrays["descriptors"], arrays["rgb"], DescriptorMetric(str(arrays["metric"]))
-            )
+                arrays["keypoints"], arrays["descriptors"], arrays["rgb"], DescriptorMetric(str(arrays["metric"])),
+                arrays.get("is_dark"),
+            )  # fmt: skip
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected the features of an image: {error}") from error

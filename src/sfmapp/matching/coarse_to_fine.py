@@ -75,7 +75,8 @@ def match_features(
     if metric != DescriptorMetric.ROOT_SIFT:
         match = match_binary if metric == DescriptorMetric.HAMMING else match_euclidean
         return Putative(match(first, second, options.max_ratio, options.max_distance))
-    search, limits, num_coarse = ProductSearch(first, second), (options.max_ratio, options.max_distance), None
+    search = ProductSearch(first, second, features[0].is_dark, features[1].is_dark)
+    limits, num_coarse = (options.max_ratio, options.max_distance), None
     if backgrounds[0] is not None and backgrounds[1] is not None:
         images = GuidedImage.of(features[0], backgrounds[0]), GuidedImage.of(features[1], backgrounds[1])
         coarse = mutual_neighbors(*search.among_first(options.coarse_features), *limits)

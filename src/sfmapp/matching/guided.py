@@ -78,7 +78,8 @@ def background_of(features: Features) -> Ints:
     """
     keypoints = features.keypoints.astype(np.float64)
     xy = np.ascontiguousarray(keypoints[:, :2])
-    return background_products(features.descriptors, xy, 3.0 * keypoints[:, 2], _BACKGROUND_SAMPLE)
+    radius = 3.0 * keypoints[:, 2]
+    return background_products(features.descriptors, xy, radius, _BACKGROUND_SAMPLE, features.is_dark)
 
 
 def change_of_shape(image1: GuidedImage, image2: GuidedImage, matches: NDArray[np.int32]) -> Array:

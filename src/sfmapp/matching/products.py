@@ -188,14 +188,25 @@ class ProductSearch:
     """The search for the best partners among the first so many descriptors of two images, which can be carried on.
 
     Products that it has had are not computed again, so that a look at a few costs nothing where all are compared.
+
+    Args:
+        descriptors1, descriptors2: (N, 128) and (M, 128) uint8.
+        is_dark1, is_dark2: (N,) and (M,) bool; only descriptors that agree are compared. None: all are.
     """
 
-    def __init__(self, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> None:
-        """(N, 128) and (M, 128) uint8."""
+    def __init__(
+        self,
+        descriptors1: NDArray[np.uint8],
+        descriptors2: NDArray[np.uint8],
+        is_dark1: NDArray[np.bool_] | None = None,
+        is_dark2: NDArray[np.bool_] | None = None,
+    ) -> None:
         self._descriptors = descriptors1, descriptors2
-        self._rows = Best.of_none(_whole_tiles(len(descriptors1)))
-        self._columns = Best.of_none(_whole_tiles(len(descriptors2)))
-        self._done = 0, 0
+        if is_dark1 is None or is_dark2 is None:
+            self._parts = [_PartSearch(np.arange(len(descriptors1)), np.arange(len(descriptors2)))]
+        else:
+            kinds = (is_dark1, is_dark2), (~is_dark1, ~is_dark2)
+            self._parts = [_PartSearch(*(np.flatnonzero(which) for which in kind)) for kind in kinds]
 
     def among_first(self, size: int) -> tuple[Best, Best]:
         """The best partner by dot product of each descriptor, in both directions; the first of equals wins.
@@ -205,20 +216,54 @@ class ProductSearch:
 
         Returns:
             Of those of image 1 and of those of image 2; products are 0 where there is none, and no partner has a
-            product that is not positive. Overwritten by the next call.
+            product that is not positive.
         """
-        n, m = (min(_whole_tiles(size), len(each)) for each in self._descriptors)
+        for part in self._parts:
+            part.go_on(self._descriptors, _whole_tiles(size))
+        best = tuple(Best.of_none(max(part.end(side) for part in self._parts)) for side in (0, 1))
+        for part in self._parts:
+            part.enter(best)
+        return best[0], best[1]
+
+
+class _PartSearch:
+    """The search among descriptors at ascending positions (K,) and (L,) of two images."""
+
+    def __init__(self, positions1: NDArray[np.int64], positions2: NDArray[np.int64]) -> None:
+        self._positions = positions1, positions2
+        self._best = Best.of_none(_whole_tiles(len(positions1))), Best.of_none(_whole_tiles(len(positions2)))
+        self._done = 0, 0
+
+    def go_on(self, descriptors: tuple[NDArray[np.uint8], NDArray[np.uint8]], size: int) -> None:
+        """Compare those at positions below a size, and some behind it that fill the last tile."""
+        firsts = [min(_whole_tiles(int(np.searchsorted(each, size))), len(each)) for each in self._positions]
+        n, m = firsts
         if (n, m) != self._done:
             a, packed = (
-                pack(each, np.arange(num))
-                for pack, each, num in zip((pack_rows, pack_groups), self._descriptors, (n, m), strict=True)
+                pack(each, positions[:num])
+                for pack, each, positions, num in zip(
+                    (pack_rows, pack_groups), descriptors, self._positions, (n, m), strict=True
+                )
             )
             # to the right of what is done, then below: partners come in ascending order
             row, group = min(_whole_tiles(self._done[0]), len(a)), _whole_tiles(self._done[1]) // LANES
-            _scan(a, packed, self._rows, self._columns, (0, row), (group, len(packed)))
-            _scan(a, packed, self._rows, self._columns, (row, len(a)), (0, len(packed)))
+            _scan(a, packed, *self._best, (0, row), (group, len(packed)))
+            _scan(a, packed, *self._best, (row, len(a)), (0, len(packed)))
             self._done = n, m
-        return Best(*(array[:n] for array in self._rows)), Best(*(array[:m] for array in self._columns))
+
+    def end(self, side: int) -> int:
+        """The position behind the last one of an image that was compared."""
+        return int(self._positions[side][self._done[side] - 1]) + 1 if self._done[side] else 0
+
+    def enter(self, best: tuple[Best, ...]) -> None:
+        """Put what was found where it belongs among all descriptors of the images."""
+        for side, (all_, mine) in enumerate(zip(best, self._best, strict=True)):
+            num = self._done[side]
+            at, partner = self._positions[side][:num], mine.partner[:num]
+            others = self._positions[1 - side]
+            all_.first[at], all_.second[at] = mine.first[:num], mine.second[:num]
+            if len(others):
+                all_.partner[at] = np.where(partner >= 0, others[partner], -1)
 
 
 def _whole_tiles(num: int) -> int:
@@ -253,7 +298,11 @@ def _scan_background(
 
 
 def background_products(
-    descriptors: NDArray[np.uint8], xy: NDArray[np.float64], radius: NDArray[np.float64], sample_size: int
+    descriptors: NDArray[np.uint8],
+    xy: NDArray[np.float64],
+    radius: NDArray[np.float64],
+    sample_size: int,
+    is_dark: NDArray[np.bool_] | None = None,
 ) -> Ints:
     """How like each feature some unrelated one looks: the largest product with a sample of its own image.
 
@@ -262,11 +311,18 @@ def background_products(
         xy: (N, 2) pixels.
         radius: (N,) pixels around each feature in which the others show the same thing and do not count.
         sample_size: features at equal steps through the image's list, so from all scales.
+        is_dark: (N,) bool; only those that agree are compared. None: all are.
     """
     n = len(descriptors)
-    sample = np.unique(np.linspace(0, max(n - 1, 0), min(n, sample_size)).astype(np.int64))
-    a, packed = pack_rows(descriptors, np.arange(n)), pack_groups(descriptors, sample)
-    best = np.zeros(len(a), np.int32)
-    unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
-    _scan_background(a, packed, xy, sample, radius, best, unbounded, TileRoom.make())
-    return best[:n]
+    is_sample = np.zeros(n, bool)
+    is_sample[np.linspace(0, max(n - 1, 0), min(n, sample_size)).astype(np.int64)] = True
+    found = np.zeros(n, np.int32)
+    for kind in [np.ones(n, bool)] if is_dark is None else [is_dark, ~is_dark]:
+        mine = np.flatnonzero(kind)
+        sample = np.flatnonzero(is_sample[mine])
+        a, packed = pack_rows(descriptors, mine), pack_groups(descriptors, mine[sample])
+        best = np.zeros(len(a), np.int32)
+        unbounded = np.full(len(packed) * LANES, np.iinfo(np.int32).max, np.int32)
+        _scan_background(a, packed, xy[mine], sample, radius[mine], best, unbounded, TileRoom.make())
+        found[mine] = best[: len(mine)]
+    return found

@@ -38,6 +38,8 @@ class Features:
         descriptors: (N, D) as ``metric`` says; ORB has 32 bytes. (N, 0) where there are none, and matches are given.
         rgb: (N, 3) uint8 colour of the pixel under each keypoint.
         metric: what the descriptors are.
+        is_dark: (N,) bool, whether a keypoint is darker than what lies around it, which no change of light turns into
+            the opposite, so that only those that agree are compared; None where that is not known.
 
     Example:
         >>> features = sfmapp.Features.from_arrays(xy, descriptors, metric="l2")  # SuperPoint, DISK, ALIKED, ...
@@ -47,6 +49,7 @@ class Features:
     descriptors: NDArray[Any]
     rgb: NDArray[np.uint8]
     metric: DescriptorMetric = DescriptorMetric.ROOT_SIFT
+    is_dark: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)

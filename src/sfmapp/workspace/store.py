@@ -47,7 +47,7 @@ class StoredFeatures(Features):
         return read()
 
     def without_descriptors(self) -> Features:
-        return Features(self.keypoints, np.zeros((len(self), 0), np.uint8), self.rgb, self.metric)
+        return Features(self.keypoints, np.zeros((len(self), 0), np.uint8), self.rgb, self.metric, self.is_dark)
 
 
 class Store:
