@@ -76,9 +76,10 @@ def test_view_without_rerun(without: str, tmp_path: Path, capfd: pytest.CaptureF
 
 @pytest.mark.parametrize("without", ["rerun"], indirect=True)
 def test_a_run_without_rerun_goes_on_without_a_recording(without: str, tmp_path: Path) -> None:
-    from sfmapp.viewer.recording import draw_in_child
+    from sfmapp.viewer.recording import Drawer
 
-    problem = draw_in_child("run", tmp_path, tmp_path / "recording.rrd", 1, 10.0)
+    with Drawer() as drawer:
+        problem = drawer.draw("run", tmp_path, tmp_path / "recording.rrd", 1, 10.0)
     assert "pip install 'rerun-sdk" in problem
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import sys
 from dataclasses import replace
@@ -28,7 +29,7 @@ from sfmapp.viewer import listener as listener_module
 from sfmapp.viewer import view as view_module
 from sfmapp.viewer.listener import RecordingListener
 from sfmapp.viewer.photos import load_screen_photo
-from sfmapp.viewer.recording import write_recording
+from sfmapp.viewer.recording import Drawer, write_recording
 from sfmapp.viewer.replay import Replay, make_replay
 from sfmapp.viewer.stage import set_stage
 from sfmapp.viewer.view import free_port, server_command, server_url, view, window_command
@@ -345,6 +346,27 @@ def test_a_crash_of_the_other_process_is_a_report_not_an_error(
     assert path.read_text() == "older"
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     assert "did not start" in write_recording(path, make_replay(image_set, features, [model], [])).problem
+
+
+def test_a_drawer_that_waits_draws_once_and_ends_with_its_run(
+    job: tuple[ImageSet, list[Features], Reconstruction], tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    image_set, features, model = job
+    with Drawer() as drawer:
+        assert drawer.get_ready() == drawer.get_ready() == ""
+        child = drawer._child
+        assert child is not None
+        path = tmp_path / "recording.rrd"
+        assert write_recording(path, make_replay(image_set, features, [model], []), drawer=drawer).problem == ""
+        assert "EncodedImage:blob" in entities_of(path)["/photo"]
+        assert child.returncode == 0
+    with Drawer() as drawer:
+        drawer.get_ready()
+        child = drawer._child
+        assert child is not None
+        assert child.poll() is None
+    assert child.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

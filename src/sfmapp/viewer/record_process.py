@@ -1,16 +1,27 @@
-"""Draws a recording in a process of its own: ``python -m sfmapp.viewer.record_process KIND FOLDER OUTPUT THREADS``.
+"""Draws a recording in a process of its own: ``python -m sfmapp.viewer.record_process``.
 
 rerun takes half a second and a hundred megabytes to load; here they, and whatever may go wrong in it, stay away from
-the run.
+the run. When it is loaded a line is read that says what to draw: ``[KIND, FOLDER, OUTPUT, THREADS]`` as JSON.
 """
 
 from __future__ import annotations
 
+import gc
+import json
 import sys
 from pathlib import Path
 
 
-def main(kind: str, folder: str, output: str, threads: str) -> None:
+def main() -> None:
+    """Load what takes long, and draw if there is something to draw in the end."""
+    gc.disable()  # nothing that is loaded is ever rubbish
+    import rerun  # noqa: F401
+
+    if line := sys.stdin.readline():
+        draw(*json.loads(line))
+
+
+def draw(kind: str, folder: str, output: str, threads: int) -> None:
     """Draw what lies in folder: the replay of a run, a dense result, a calibration, a rig, a pair, and so on."""
     if kind == "dense":
         from sfmapp.viewer.dense_replay import DenseReplay
@@ -75,8 +86,8 @@ def main(kind: str, folder: str, output: str, threads: str) -> None:
     from sfmapp.viewer.replay import Replay
     from sfmapp.viewer.rrd import write_rrd
 
-    write_rrd(Replay.load(Path(folder)), Path(output), int(threads))
+    write_rrd(Replay.load(Path(folder)), Path(output), threads)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

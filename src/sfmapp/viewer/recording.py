@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import subprocess
 import sys
 import tempfile
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 from sfmapp.children import with_parent
 from sfmapp.errors import InputError
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
 Kind = Literal["run", "dense", "calibration", "rig", "pair", "transfer", "lines", "clouds", "stereo", "carve", "sweep"]
 
 __all__ = [
-    "Message", "RecordingListener", "RecordingReport", "Step", "draw_in_child", "record_in_child", "write_recording",
+    "Drawer", "Message", "RecordingListener", "RecordingReport", "Step", "record_in_child", "write_recording",
 ]  # fmt: skip
+
+# a child that draws a run is stopped after so many seconds
+_RUN_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,9 @@ class RecordingReport:
 
 
 def write_recording(
-    path: Path, replay: Replay, photographs: Sequence[ImageRecord] = (), *, threads: int = 1, timeout_s: float = 600.0
-) -> RecordingReport:
+    path: Path, replay: Replay, photographs: Sequence[ImageRecord] = (), *, threads: int = 1,
+    drawer: Drawer | None = None,
+) -> RecordingReport:  # fmt: skip
     """Write a recording that replays a run, in a child process; never raises for what happens there.
 
     Args:
@@ -57,15 +62,22 @@ def write_recording(
         replay: what it shows, see :func:`~sfmapp.viewer.replay.make_replay`.
         photographs: I of them, in the order of the replay, if some are no files; none if all are.
         threads: photographs read at a time.
-        timeout_s: the child is stopped after this long.
+        drawer: has it drawn; None: one that is started now.
     """
     return record_in_child(
-        path, "run", lambda folder: _with_files(replay, photographs, folder), threads=threads, timeout_s=timeout_s
-    )
+        path, "run", lambda folder: _with_files(replay, photographs, folder), threads=threads, timeout_s=_RUN_S,
+        drawer=drawer,
+    )  # fmt: skip
 
 
 def record_in_child(
-    path: Path, kind: Kind, make: Callable[[Path], HandedOver], *, threads: int = 1, timeout_s: float = 300.0
+    path: Path,
+    kind: Kind,
+    make: Callable[[Path], HandedOver],
+    *,
+    threads: int = 1,
+    timeout_s: float = 300.0,
+    drawer: Drawer | None = None,
 ) -> RecordingReport:
     """Write a recording in a child process; never raises for what happens there, or for a disk that is full.
 
@@ -73,12 +85,13 @@ def record_in_child(
         path: the file, replaced when the new one is whole.
         make: what it shows; given the folder that the child reads, and which is then removed.
         timeout_s: the child is stopped after this long.
+        drawer: has it drawn; None: one that is started now.
     """
     start = time.monotonic()
     try:
-        with tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
+        with Drawer() as own, tempfile.TemporaryDirectory(prefix="recording-", dir=path.parent) as name:
             make(Path(name)).save(Path(name))
-            problem = draw_in_child(kind, Path(name), path, threads, timeout_s)
+            problem = (drawer or own).draw(kind, Path(name), path, threads, timeout_s)
     except OSError as error:
         problem = error.strerror or str(error)
     size = path.stat().st_size if not problem else 0
@@ -100,24 +113,53 @@ def _with_files(replay: Replay, photographs: Sequence[ImageRecord], folder: Path
     return replace(replay, image_paths=paths)
 
 
-def draw_in_child(kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
-    """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
-    try:
-        require("rerun")
-    except MissingPackageError as missing:
-        return f"{missing}: {missing.advice}"
-    arguments = [kind, str(folder.absolute()), str(path.absolute()), str(threads)]
-    command = with_parent([sys.executable, "-P", "-m", "sfmapp.viewer.record_process", *arguments])
-    try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            timeout=timeout_s, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return f"not finished after {timeout_s:g} s"
-    except OSError as error:
-        return f"the process did not start: {error.strerror}"
-    if done.returncode == 0 and path.is_file():
+class Drawer:
+    """A child process that draws one recording; a context manager that ends it.
+
+    rerun takes half a second to load. A child that is started early has done so by the time there is something to draw.
+    """
+
+    def __init__(self) -> None:
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._child is not None:
+            with self._child:
+                self._child.kill()
+
+    def get_ready(self) -> str:
+        """Start the child, in the thread that will have it draw, if there is none; returns what went wrong, empty for
+        nothing."""
+        if self._child is not None:
+            return ""
+        try:
+            require("rerun")
+        except MissingPackageError as missing:
+            return f"{missing}: {missing.advice}"
+        command = with_parent([sys.executable, "-P", "-m", "sfmapp.viewer.record_process"])
+        try:
+            self._child = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            )
+        except OSError as error:
+            return f"the process did not start: {error.strerror}"
         return ""
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    return f"exit code {done.returncode}: {lines[-1] if lines else 'no message'}"
+
+    def draw(self, kind: Kind, folder: Path, path: Path, threads: int, timeout_s: float) -> str:
+        """Draw what lies in folder into the file path; returns what went wrong, empty for nothing."""
+        if problem := self.get_ready():
+            return problem
+        assert self._child is not None
+        task = json.dumps([kind, str(folder.absolute()), str(path.absolute()), threads])
+        try:
+            _, said = self._child.communicate(task.encode(), timeout_s)
+        except subprocess.TimeoutExpired:
+            return f"not finished after {timeout_s:g} s"
+        code = self._child.returncode
+        if code == 0 and path.is_file():
+            return ""
+        lines = said.decode(errors="replace").strip().splitlines()
+        return f"exit code {code}: {lines[-1] if lines else 'no message'}"

@@ -22,6 +22,7 @@ from sfmapp.pipelines.sparse.run import Run
 from sfmapp.pipelines.sparse.videos import load_sources
 from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_world
 from sfmapp.viewer.listener import RecordingListener
+from sfmapp.viewer.recording import Drawer
 from sfmapp.workspace.layout import RECONSTRUCT
 from sfmapp.workspace.options import Options
 from sfmapp.workspace.usage import Stopwatch
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
     from sfmapp.images.image_set import ImageSet
     from sfmapp.report.model import ReconstructionReport
     from sfmapp.scene.reconstruction import Reconstruction
+
+# So many photographs are mapped in seconds, of which loading rerun beside it saves half a one. The child of a larger
+# set would hold a hundred megabytes for nothing.
+_SOON_MAPPED = 200
 
 
 class RunResult(NamedTuple):
@@ -72,9 +77,10 @@ def reconstruct(
         InterruptedRunError: ``events`` was asked to stop; the same call resumes.
     """
     recorder = RecordingListener() if record else None
-    with Run.opened(
-        RECONSTRUCT, name_of(images), output, options, events=events, watch=watch, recorder=recorder, images=images
-    ) as run:
+    with Drawer() as drawer, Run.opened(
+        RECONSTRUCT, name_of(images), output, options, events=events, watch=watch, recorder=recorder, drawer=drawer,
+        images=images,
+    ) as run:  # fmt: skip
         run.listen(recorder)
         report = _run(run)
         model, _ = read_model(run.workspace.model())
@@ -131,6 +137,8 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
         raise _too_few_photographs(image_set)
     import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     correspondences = find_matches(run, image_set, keys)
+    if run.recorder is not None and run.drawer is not None and len(image_set.images) <= _SOON_MAPPED:
+        run.drawer.get_ready()  # what goes wrong is told when it is to draw
     # all that follows knows pictures by keypoints and matches; descriptors are in the database
     run.features = [features.without_descriptors() for features in run.features]
     with run.stage("mapping"):

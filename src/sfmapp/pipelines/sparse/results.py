@@ -111,7 +111,7 @@ def _record(run: Run, models: Sequence[Reconstruction]) -> str:
         run.image_set, run.features, models, seen.steps, seen.messages,
         title=os.path.basename(os.path.abspath(run.source)),
     )  # fmt: skip
-    outcome = write_recording(path, replay, run.image_set.images, threads=run.threads)
+    outcome = write_recording(path, replay, run.image_set.images, threads=run.threads, drawer=run.drawer)
     if not outcome.problem:
         return WRITTEN
     path.unlink(missing_ok=True)

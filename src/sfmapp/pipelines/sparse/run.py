@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sfmapp.scene.correspondences import Correspondences
     from sfmapp.scene.features import Features
     from sfmapp.scene.reconstruction import Reconstruction
+    from sfmapp.viewer.recording import Drawer
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class Run(Job):
     Attributes:
         images: what was given to reconstruct.
         recorder: watches the run for a recording; None if none is wanted.
+        drawer: has the recording drawn; None: one that is started then.
         image_set, features, correspondences: results so far.
         stages: what each stage has said.
         control: ground control points that it was given; known: lengths; poses: of photographs.
@@ -61,6 +63,7 @@ class Run(Job):
 
     images: GivenImages
     recorder: RecordingListener | None = None
+    drawer: Drawer | None = None
     image_set: ImageSet | None = None
     features: list[Features] = field(default_factory=list)
     correspondences: Correspondences | None = None
