@@ -71,7 +71,7 @@ def room(folder: Path) -> None:
 
     sequence = walk(840, seed=5)
     for n in range(0, 840, 10):
-        cv2.imwrite(str(folder / f"{n:04d}.png"), sequence.frame(n).images[0])
+        cv2.imwrite(str(folder / f"{n:04d}.png"), sequence.image(n))
 
 
 FRESH: dict[str, Callable[[Path], None]] = {
@@ -120,6 +120,7 @@ def measured(case: str) -> Iterator[Row]:
             for stage in plan["stages"]
             if stage["stage"] in report["usage"]
         },
+        "peaks_mb": {name: usage["peak_memory_mb"] for name, usage in report["usage"].items() if name != "kernels"},
         "groups": plan["groups"][:6],
         "warnings": [doubt["message"] for doubt in plan["doubts"] if doubt["weight"] == "warning"],
         "sentence": report.get("plan", {}).get("sentence", ""),

@@ -290,7 +290,8 @@ def test_a_run_says_in_words_whether_its_plan_was_right(planned: PlanReport) -> 
 
 def test_intervals_read_as_people_say_them() -> None:
     assert Interval.about(50.0, 0.2).text("s") == "40 to 60 s"
-    assert Interval.about(1234.0, 0.0).text("MB") == "1234 MB"
+    assert Interval.about(1234.0, 0.0).text("MB") == "1230 MB"
+    assert Interval(4.0, 99.6, 56143.0).text("features") == "4 to 56100 features"
     assert Interval.about(10.0, 0.5, 2.0) == Interval(5.0, 10.0, 30.0)
     assert Interval(1.0, 2.0, 3.0).holds(3.0)
     assert not Interval(1.0, 2.0, 3.0).holds(3.1)

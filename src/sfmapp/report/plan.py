@@ -37,8 +37,8 @@ class Interval(Report, kw_only=False):
 
 
 def _short(value: float) -> str:
-    """Two digits, and all before the point."""
-    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+    """Two digits below a hundred, three above."""
+    return f"{value:.2g}" if value < 99.5 else f"{float(f'{value:.3g}'):.0f}"
 
 
 class StagePlan(Report):
