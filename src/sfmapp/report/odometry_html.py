@@ -165,8 +165,7 @@ def _gaps(gaps: Sequence[Gap]) -> str:
     ]
     keys = ("first_frame", "last_frame", "num_frames", "duration_s", "map_before", "map_after")
     rows = [[("", f"{row[k]:.2f}" if k == "duration_s" else row[k]) for k in keys] for row in gaps[:MAX_GAPS]]
-    more = f"<p class=dim>{len(gaps) - MAX_GAPS} more in report.json</p>" if len(gaps) > MAX_GAPS else ""
-    return "<h2>Gaps: frames without a pose</h2>" + table(head, rows) + more
+    return "<h2>Gaps: frames without a pose</h2>" + table(head, rows) + _more(len(gaps))
 
 
 def _maps(maps: Iterable[MapReport]) -> str:
@@ -331,31 +330,48 @@ def _filter(found: FilterReport | None) -> str:
     if found is None:
         return ""
     text = (
-        f"{found.num_poses} poses at {found.rate_hz:.4g} Hz, predicted by "
-        f"{found.prediction.replace('imu', 'the IMU')}; {found.num_used} measured poses corrected them. "
-        + ("" if found.reason is None else f"Not by the IMU: {found.reason}. ")
+        f"{found.num_poses} poses at {found.rate_hz:.4g} Hz, predicted by {found.prediction.replace('imu', 'the IMU')} "
+        f"and corrected by {found.num_used} measured poses."
+        + ("" if found.reason is None else f" Not by the IMU: {found.reason}.")
     )
+    facts = [("t", "what"), ("", "found"), ("t", "expected")]
+    body = f"<h2>Filtered live poses</h2><p>{escape(text)}</p>" + table(facts, _filter_facts(found))
+    if found.rejected:
+        rows = [[("t", row.name), ("", f"{row.timestamp_s:.2f}"), ("w", row.reason)] for row in found.rejected]
+        head = [("t", "frame left out"), ("", "at, s"), ("t", "why")]
+        body += table(head, rows[:MAX_GAPS]) + _more(len(rows))
+    if found.gaps:
+        rows = [
+            [("", f"{gap.first_s:.2f}"), ("", f"{gap.last_s:.2f}"), ("", f"{gap.position_sigma:.3g}"),
+             ("", f"{gap.rotation_sigma_deg:.2f}")] for gap in found.gaps
+        ]  # fmt: skip
+        head = [("", "gap: last pose, s"), ("", "until, s"), ("", "position sigma"), ("", "rotation sigma, deg")]
+        body += table(head, rows[:MAX_GAPS]) + _more(len(rows))
+    return body
+
+
+def _more(num: int) -> str:
+    return f"<p class=dim>{num - MAX_GAPS} more in report.json</p>" if num > MAX_GAPS else ""
+
+
+def _filter_facts(found: FilterReport) -> list[list[tuple[str, str]]]:
+    """Innovations beside what they should be, and how late rows are."""
+    rows = []
     if told := found.consistency:
-        text += (
-            f"Squares of what the {told.num_innovations} measured poses said beyond the prediction are "
-            f"{told.mean:.2f} of what is expected; independent ones would be {told.mean_low:.2f} to "
-            f"{told.mean_high:.2f} in 95 % of runs, and these, which are worth {told.num_independent:.0f} independent "
-            f"ones, {told.correlated_low:.2f} to {told.correlated_high:.2f}. "
-        )
+        rows += [
+            [("t", f"squared innovations of {told.num_innovations} poses, over what they should be"),
+             ("", f"{told.mean:.2f}"),
+             ("w", f"{told.correlated_low:.2f} to {told.correlated_high:.2f} in 95 % of runs, of the "
+                   f"{told.num_independent:.0f} independent ones that they are worth; {told.mean_low:.2f} to "
+                   f"{told.mean_high:.2f} if all were")],
+            [("t", "of them inside the 95 % interval of one"), ("", f"{100 * told.share_inside:.0f} %"), ("w", "95 %")],
+        ]  # fmt: skip
         if told.correlation is not None:
-            text += (
-                f"Those of neighbouring frames are correlated by {told.correlation:.2f}; independent ones by less than "
-                f"{told.max_correlation:.2f}."
-            )
-    rows = [
-        [("", f"{gap.first_s:.2f}"), ("", f"{gap.last_s:.2f}"), ("", f"{gap.position_sigma:.3g}"),
-         ("", f"{gap.rotation_sigma_deg:.2f}")] for gap in found.gaps[:MAX_GAPS]
-    ]  # fmt: skip
-    head = [("", "last pose, s"), ("", "until, s"), ("", "position sigma"), ("", "rotation sigma, deg")]
-    body = f"<h2>Filtered live poses</h2><p>{escape(text)}</p>"
-    for row in found.rejected[:MAX_GAPS]:
-        body += f"<p class=dim>{escape(row.name)} left out: {escape(row.reason)}</p>"
-    return body + (table(head, rows) if rows else "")
+            limit = f"within {told.max_correlation:.2f} of 0 if the filter knew all that lasts"
+            rows.append([("t", "correlation with the frame before"), ("", f"{told.correlation:.2f}"), ("w", limit)])
+    ms = f"{found.latency_ms_median:.2g} / {found.latency_ms_p95:.2g} / {found.latency_ms_max:.3g}"
+    rows.append([("t", "delay of a row, ms: median / 95 % / most"), ("", ms), ("w", "")])
+    return rows
 
 
 def _timing(timing: TimingReport | None) -> str:
