@@ -147,7 +147,7 @@ def test_frames_are_spaced_by_what_is_wanted(walls: Walls, passing: list[Pixels]
         xy1, xy2 = (walls.points((-1.2 + 0.04 * row.number, 0, 0)) for row in (first, second))
         seen = inside(xy1, xy2)
         true = motion_between(xy1[seen], xy2[seen], (HEIGHT, WIDTH))
-        assert 0.5 <= max(true.parallax / 0.02, (1 - true.overlap) / 0.2) <= 1.6
+        assert 0.5 <= max(true.parallax / 0.02, (1 - true.overlap) / 0.25) <= 1.6
 
 
 def test_wider_and_narrower_spacing(passing: list[Pixels]) -> None:

@@ -20,8 +20,8 @@ class VideoOptions:
         max_frames: most frames of one video; where there would be more, every second one is left out, or more.
     """
 
-    parallax: float = 0.015
-    overlap: float = 0.8
+    parallax: float = 0.02
+    overlap: float = 0.75
     max_frames: int = 600
 
     def __post_init__(self) -> None:
