@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
@@ -20,15 +20,23 @@ from sfmapp.images.products import IN_MEMORY
 from sfmapp.images.report import CameraPrior, ImageFacts, ImagesReport
 from sfmapp.reporting import NamedReason
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
 Images = str | os.PathLike[str] | ImageSet | ImageSource | Mapping[str, NDArray[Any]]
 """What every function takes for photographs."""
 GivenImages = Images | Sequence[str | os.PathLike[str]]
 """The same, and several files and folders."""
 
 
+def are_paths(images: GivenImages) -> TypeIs[Sequence[str | os.PathLike[str]]]:
+    """Whether several files and folders are given."""
+    return isinstance(images, list | tuple) and all(isinstance(one, str | os.PathLike) for one in images)
+
+
 def name_of(images: GivenImages) -> str:
     """What is written down as the source of the photographs."""
-    if isinstance(images, Sequence) and not isinstance(images, str):
+    if are_paths(images):
         return ", ".join(os.path.abspath(one) for one in images)
     if isinstance(images, str | os.PathLike):
         return os.fspath(images)

@@ -14,7 +14,7 @@ from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.images.folder import load_found
 from sfmapp.images.headers import UnusableImage, read_header
-from sfmapp.images.load import GivenImages, Images, load_images
+from sfmapp.images.load import GivenImages, Images, are_paths, load_images
 from sfmapp.images.pixels import decode_bytes
 from sfmapp.images.sources import Found, find_files, find_images, printable
 from sfmapp.images.video import is_stream, is_video
@@ -57,7 +57,7 @@ def sources_of(images: GivenImages) -> Images | Sources:
     """
     if isinstance(images, str | os.PathLike):
         given = [os.fspath(images)]
-    elif isinstance(images, Sequence):
+    elif are_paths(images):
         given = [os.fspath(one) for one in images]
     else:
         return images
