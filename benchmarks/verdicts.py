@@ -644,6 +644,29 @@ class Promise:
     date: str
 
 
+def video_promises(folder: Path) -> Iterator[Promise]:
+    """What is asked of frames that are chosen of videos, beside as many at equal distances, and beside pycolmap."""
+    report = read(folder, "video")
+    date, rows = report["date"][:10], {(row["case"], row["how"], row["who"]): row for row in report["rows"]}
+    films = [case for case, how, who in rows if (how, who) == ("chosen", "sfmapp")]
+    chosen = {film: rows[film, "chosen", "sfmapp"] for film in films}
+    text = "of frames chosen of a video, 98 % are registered in one model"
+    held = [row.get("registered", 0) >= 0.98 * row["num"] for row in chosen.values()]
+    yield Promise("video", text, sum(held), len(held), date)
+    for (how, who), what in {
+        ("every n-th", "sfmapp"): "as many frames at equal distances",
+        ("chosen", "pycolmap"): "pycolmap on the same frames",
+    }.items():
+        pairs = [(chosen[film], rows[film, how, who]) for film in films if (film, how, who) in rows]
+        text = f"frames chosen of a video: no fewer are registered than of {what}"
+        held = [row.get("registered", 0) >= other.get("registered", 0) for row, other in pairs]
+        yield Promise("video", text, sum(held), len(held), date)
+        both = [(row, other) for row, other in pairs if "failed" not in row and "failed" not in other]
+        text = f"frames chosen of a video: centres are no farther off than of {what}"
+        held = [row["center_share"] <= other["center_share"] for row, other in both]
+        yield Promise("video", text, sum(held), len(held), date)
+
+
 def town_promises(folder: Path) -> Iterator[Promise]:
     """What is asked of a rendered town: views registered, centres right, and none dearer than those of a small one."""
     report = read(folder, "town")
@@ -818,6 +841,7 @@ def promises(folder: Path) -> Iterator[Promise]:
             f"a photograph in a hall of look-alikes, with a model of the {model}, is where it is said to be, or refused"
         )
         yield Promise("locating", text, sum(row["outcome"] != "wrong" for row in rows), len(rows), date)
+    yield from video_promises(folder)
     report = read(folder, "adding")
     rows, date = [row for row in report["rows"] if "center_share" in row], report["date"][:10]
 

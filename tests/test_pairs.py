@@ -196,6 +196,12 @@ def test_names_of_many_hands_are_no_sequence() -> None:
     assert find_sequences(records([f"f{30 * n:06d}.jpg" for n in range(50)])) == [list(range(50))]
 
 
+def test_chosen_frames_of_a_video_are_a_sequence_however_far_apart() -> None:
+    numbers = np.cumsum(np.random.default_rng(2).integers(5, 400, 30))
+    names = [f"{video}/frame_{n:06d}.jpg" for video in ("back", "walk") for n in numbers]
+    assert find_sequences(records(names)) == [list(range(30)), list(range(30, 60))]
+
+
 def test_time_stamps_order_what_names_do_not() -> None:
     rng = np.random.default_rng(1)
     names = [f"{n:032x}.jpg" for n in rng.integers(2**60, 2**62, 10)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,12 @@ import pytest
 from numpy.typing import NDArray
 
 from sfmapp.errors import InputError
+from sfmapp.evaluation.poses import evaluate_poses
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3
 from sfmapp.odometry.frontend.pyramid import build_pyramid
+from sfmapp.pipelines.sparse.add import add_photographs
+from sfmapp.pipelines.sparse.reconstruct import reconstruct
 from sfmapp.pipelines.sparse.videos import Sources, sources_of
 from sfmapp.video.following import Follower
 from sfmapp.video.frames import choose_frames
@@ -24,6 +28,7 @@ from sfmapp.video.motion import motion_between
 from sfmapp.video.options import VideoOptions
 from sfmapp.video.quality import look_at
 from sfmapp.video.selection import FrameRow, Selector
+from sfmapp.workspace.options import load_options
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -147,7 +152,7 @@ def test_frames_are_spaced_by_what_is_wanted(walls: Walls, passing: list[Pixels]
         xy1, xy2 = (walls.points((-1.2 + 0.04 * row.number, 0, 0)) for row in (first, second))
         seen = inside(xy1, xy2)
         true = motion_between(xy1[seen], xy2[seen], (HEIGHT, WIDTH))
-        assert 0.5 <= max(true.parallax / 0.02, (1 - true.overlap) / 0.25) <= 1.6
+        assert 0.5 <= max(true.parallax / 0.02, (1 - true.overlap) / 0.2) <= 1.6
 
 
 def test_wider_and_narrower_spacing(passing: list[Pixels]) -> None:
@@ -314,3 +319,47 @@ def test_sources_are_told_apart(tmp_path: Path) -> None:
     assert sources_of([str(photos)]) == str(photos)
     assert sources_of([film, photos, film]) == Sources((film,), (str(photos),))
     assert sources_of([photos, tmp_path]) == Sources((), (str(photos), str(tmp_path)))
+
+
+def true_pose(center: Sequence[float]) -> Array:
+    """(7,) cam_from_world of a camera that looks ahead."""
+    return rigid3.from_matrix(np.eye(3), -np.asarray(center, float))
+
+
+def test_videos_and_photographs_become_one_model_and_more_is_added(
+    walls: Walls, clip: Path, tmp_path: Path
+) -> None:  # fmt: skip
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    heights = {"a.png": -0.3, "b.png": 0.3}
+    for name, y in heights.items():
+        cv2.imwrite(str(photos / name), walls.image((0.1, y, 0.2)))
+    camera = f"PINHOLE,{FOCAL},{FOCAL},{WIDTH / 2},{HEIGHT / 2}"
+    options = load_options([], [f"images.camera={camera}", "video.parallax=0.03", "video.overlap=0.7"])
+    found = reconstruct([clip, photos], out, options, record=False)
+    videos = found.report.stages.videos
+    assert videos is not None
+    names = [frame.name for frame in videos[0].chosen]
+    assert list(found.reconstruction.image_names) == [*names, "photos/a.png", "photos/b.png"]
+    truth = {name: true_pose((-1.2 + 0.04 * int(name[-10:-4]), 0, 0)) for name in names}
+    truth |= {f"photos/{name}": true_pose((0.1, y, 0.2)) for name, y in heights.items()}
+    poses = np.array(list(truth.values()))
+    errors = evaluate_poses(
+        found.reconstruction.image_names, found.reconstruction.cam_from_world, list(truth), poses
+    )  # fmt: skip
+    assert errors.is_common.all()
+    assert np.nanmax(errors.center_error) < 0.02 * 2.4
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Videos</h2>" in page
+    assert page.count("data:image/jpeg") >= len(names)
+    frames = {path: path.stat().st_mtime_ns for path in (out / "images").rglob("*.jpg")}
+    assert reconstruct([clip, photos], out, options, record=False).report.run.is_up_to_date
+    assert frames == {path: path.stat().st_mtime_ns for path in (out / "images").rglob("*.jpg")}
+
+    back = write_clip(tmp_path / "walk.avi", [walls.image((1.0 - 0.05 * k, 0.15, 0)) for k in range(25)])
+    more = add_photographs(os.fspath(back), out, record=False)
+    added = more.report.added
+    assert added is not None
+    assert {one.name.split("/")[0] for one in added.photographs} == {"walk-2"}
+    assert all(one.model == 0 for one in added.photographs)
+    assert set(truth) < set(more.reconstruction.image_names)

@@ -68,6 +68,12 @@ def _headline(report: VideoReport) -> str:
     if report.breaks_s:
         times = ", ".join(f"{at:.1f} s" for at in report.breaks_s)
         text += f" It breaks off at {times}: a cut, or a motion too fast to be followed."
+    if report.bend_px is not None:
+        text += (
+            " A rolling shutter that reads a frame in 20 ms would shift its first and last row against each other by "
+            f"{report.bend_px[0]:.2g} px (those of a tenth of the frames by {report.bend_px[1]:.2g} px or more), which "
+            "nothing takes back."
+        )
     if report.every > 1:
         text += f" One of {report.every} frames that were due was taken, for video.max_frames."
     return text

@@ -35,14 +35,14 @@ class Follower:
     Attributes:
         first: pyramid of the frame that they were found in. last: of the last one in which they were.
         first_xy, xy: (N, 2) pixels of those that are left, there and here.
-        num_found: points that there were.
+        num_found: points that there were. step: their median motion in the last frame, as a share of the longer side.
     """
 
     def __init__(self, first: Pyramid) -> None:
         self.first = self.last = first
         self.first_xy = find_corners(first, np.empty((0, 2)), _NUM_POINTS, min_distance_px=_MIN_DISTANCE_PX)
         self.xy = self.first_xy.copy()
-        self.num_found = len(self.xy)
+        self.num_found, self.step = len(self.xy), 0.0
 
     @property
     def has_points(self) -> bool:
@@ -65,8 +65,9 @@ class Follower:
                 xy, found = self._found(frame, _turned(self.xy, turn, frame.shape))
         if not self._are_enough(xy, found):
             return False
-        self.first_xy, xy = self.first_xy[found], xy[found]
-        self.xy, self.last = self._without_drift(frame, xy), frame
+        before, self.first_xy = self.xy[found], self.first_xy[found]
+        self.xy, self.last = self._without_drift(frame, xy[found]), frame
+        self.step = float(np.median(np.linalg.norm(self.xy - before, axis=1))) / max(frame.shape)
         return True
 
     def _are_enough(self, xy: Array, found: NDArray[np.bool_]) -> bool:

@@ -38,6 +38,8 @@ _NOT_WANTED = "more than video.max_frames"
 # Beside the errors of a video's own compression, those of JPEG at this quality are none.
 _JPEG_QUALITY = 95
 _CURVE_POINTS = 400
+# Phones read the rows of a frame within 10 to 30 ms. A shift of so many pixels is more than keypoints are off.
+_READOUT_S, _BENT_PX = 0.02, 2.0
 
 
 def choose_frames(video: Path, folder: Path, options: VideoOptions, events: Events) -> VideoReport:
@@ -84,7 +86,7 @@ def choose_frames(video: Path, folder: Path, options: VideoOptions, events: Even
         missing_end=missing_end(facts, span, len(selector.rows)), every=kept.every,
         chosen=[_chosen(folder, row) for row in kept.rows], left_out=_left_out(selector.rows),
         breaks_s=[round(at, 3) for at in selector.breaks], curve=_curve(selector.rows),
-        wall_s=round(time.monotonic() - start, 3),
+        bend_px=_bend_px(kept.rows, max(facts.width, facts.height)), wall_s=round(time.monotonic() - start, 3),
     )  # fmt: skip
     _tell(report, events)
     return report
@@ -98,9 +100,10 @@ def frame_name(number: int) -> str:
 def write_table(path: Path, rows: Sequence[FrameRow]) -> None:
     """``frames.csv``: a row for each frame of the video."""
     with replaced_file(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as file:
-        file.write("frame,time_s,sharpness,parallax,overlap,file,why\n")
+        file.write("frame,time_s,sharpness,parallax,overlap,speed,file,why\n")
         for row in rows:
-            numbers = ",".join("" if v is None else f"{v:.4f}" for v in (row.sharpness, row.parallax, row.overlap))
+            values = (row.sharpness, row.parallax, row.overlap, row.speed)
+            numbers = ",".join("" if v is None else f"{v:.4f}" for v in values)
             name = frame_name(row.number) if row.is_taken else ""
             file.write(f'{row.number},{row.time_s:.4f},{numbers},{name},"{row.why}"\n')
 
@@ -234,6 +237,14 @@ def _curve(rows: Sequence[FrameRow]) -> SharpnessCurve:
     )
 
 
+def _bend_px(rows: Sequence[FrameRow], side_px: int) -> tuple[float, float] | None:
+    speeds = sorted(row.speed for row in rows if row.speed is not None)
+    if not speeds:
+        return None
+    middle, most = (speeds[int(share * (len(speeds) - 1))] for share in (0.5, 0.9))
+    return round(_READOUT_S * side_px * middle, 2), round(_READOUT_S * side_px * most, 2)
+
+
 def _tell(report: VideoReport, events: Events) -> None:
     video = report.video
     if report.missing_end:
@@ -251,6 +262,12 @@ def _tell(report: VideoReport, events: Events) -> None:
         )  # fmt: skip
     if report.is_turned:
         events.decided(STAGE, f"{video}: frames are turned upright, as the file asks for")
+    if report.bend_px is not None and report.bend_px[0] > _BENT_PX:
+        events.warned(
+            STAGE, f"{video}: points move fast at the frames that were taken: a rolling shutter that reads a frame in "
+            f"20 ms bends them by {report.bend_px[0]:.1f} px (a tenth of them by {report.bend_px[1]:.1f} px or more), "
+            "which nothing takes back; a global shutter does not", bend_px=report.bend_px,
+        )  # fmt: skip
     for left in report.left_out:
         if left.reason in ("black", "over-exposed", "without contrast") or left.reason.startswith("damaged"):
             events.decided(STAGE, f"{video}: {left.count} frames are {left.reason}, from {left.first_s:.1f} s on")

@@ -31,7 +31,7 @@ class Apart(NamedTuple):
 
     Attributes:
         parallax: mean, as a share of the longer side of the picture.
-        overlap: share of the picture that both show.
+        overlap: share of the two pictures that both show.
         flow: median motion, as a share of the longer side.
     """
 
@@ -57,12 +57,13 @@ def motion_between(xy1: Array, xy2: Array, shape: tuple[int, int]) -> Apart:
 
 
 def _overlap(xn1: Array, xn2: Array, size: Array) -> float:
-    """The smaller share of each picture that an affine motion puts inside the other."""
+    """Share of both pictures that an affine motion puts inside the other: where a camera goes ahead, all of the second
+    lies within the first."""
     affine = _affine(xn1, xn2)
     linear, shift = affine[:, :2], affine[:, 2]
     grid = (_GRID - 0.5) * size
     there, back = grid @ linear.T + shift, (grid - shift) @ np.linalg.pinv(linear).T
-    return min(float((np.abs(seen) <= size / 2).all(axis=1).mean()) for seen in (there, back))
+    return float(np.mean([(np.abs(seen) <= size / 2).all(axis=1).mean() for seen in (there, back)]))
 
 
 def incoherence(xy1: Array, xy2: Array, side: int) -> float:

@@ -21,8 +21,8 @@ class VideoOptions:
     """
 
     parallax: float = 0.02
-    overlap: float = 0.75
-    max_frames: int = 600
+    overlap: float = 0.8
+    max_frames: int = 1200
 
     def __post_init__(self) -> None:
         check_options("video", self, _RANGES)

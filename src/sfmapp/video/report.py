@@ -60,6 +60,8 @@ class VideoReport(Report):
         left_out: other frames, by reason, the most frequent first.
         breaks_s: times at which the picture has nothing of the one before.
         curve: of the sharpness.
+        bend_px: how far the first and the last row of a chosen frame are shifted against each other by a rolling
+            shutter that reads it in 20 ms: median, and what a tenth of the frames exceed; None: nothing was followed.
         key: of the video and the options that this was made with.
     """
 
@@ -77,5 +79,6 @@ class VideoReport(Report):
     left_out: Sequence[LeftFrames]
     breaks_s: Sequence[float]
     curve: SharpnessCurve
+    bend_px: Sequence[float] | None
     wall_s: float
     key: str = ""

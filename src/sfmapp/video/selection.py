@@ -22,8 +22,8 @@ from sfmapp.video.options import VideoOptions
 from sfmapp.video.quality import Look, Pixels
 
 # Shares of the wanted distance between which the sharpest frame is looked for; and how far at most where all frames
-# there are blurred.
-_OPEN, _CLOSE, _CLOSE_OF_BLURRED = 0.6, 1.3, 1.8
+# there are blurred. Frames that are too near cost time, those that are too far apart the model.
+_OPEN, _CLOSE, _CLOSE_OF_BLURRED = 0.6, 1.15, 1.5
 # What a frame at the end of that stretch may be sharper for nothing, rather than one in its middle.
 _WORTH_OF_PLACE = 0.15
 # Below this share of the median sharpness of the last frames a frame is blurred.
@@ -46,6 +46,7 @@ class FrameRow:
     Attributes:
         number: from 0. time_s: in the video. sharpness: None where it was not judged.
         parallax, overlap: against the last frame that was taken, as shares; None where it was not followed.
+        speed: median motion of points from the frame before, in longer sides a second; None where it was not followed.
         is_taken: it is one of the photographs. why: it is, or is not.
     """
 
@@ -54,6 +55,7 @@ class FrameRow:
     sharpness: float | None = None
     parallax: float | None = None
     overlap: float | None = None
+    speed: float | None = None
     is_taken: bool = False
     why: str = ""
 
@@ -96,6 +98,7 @@ class Selector(Generic[Held]):
     _num_here: int = 0
     _recent: deque[float] = field(default_factory=lambda: deque(maxlen=_NUM_RECENT))
     _last: tuple[int, Pixels] | None = None
+    _followed_s: float = 0.0
 
     def unreadable(self, number: int, time_s: float, why: str) -> None:
         """Note a frame that cannot be read."""
@@ -136,7 +139,7 @@ class Selector(Generic[Held]):
         if not follower.has_points:
             row.why = "too few points to follow"
             return
-        self._main, self._is_first, self._num_here = follower, True, 1
+        self._main, self._is_first, self._num_here, self._followed_s = follower, True, 1, row.time_s
         self._waiting = [row]
         self._best = _Candidate(row, held, row.sharpness or 0.0, "", Follower(follower.first))
 
@@ -161,6 +164,8 @@ class Selector(Generic[Held]):
         """A frame that goes on from those before."""
         assert self._main is not None
         self._num_here += 1
+        row.speed = self._main.step / max(row.time_s - self._followed_s, 1e-6)
+        self._followed_s = row.time_s
         if self._best is not None and not self._best.follower.follow(pyramid):
             self._best = None
         while True:
