@@ -329,10 +329,14 @@ def refine_extremum(
             place[0], place[1], place[2], place[3] = layer, row, col, rounds
             return False
         rounds -= 1
-        for k in range(3):
-            for i in range(3):
-                for j in range(3):
-                    d[k, i, j] = levels[layer + k][top + i, left + j] - levels[layer + k - 1][top + i, left + j]
+        # once each: looking a level up copies what is known of all of them
+        finest, fine, coarse, coarsest = levels[layer - 1], levels[layer], levels[layer + 1], levels[layer + 2]
+        for i in range(3):
+            for j in range(3):
+                r, c = top + i, left + j
+                d[0, i, j] = fine[r, c] - finest[r, c]
+                d[1, i, j] = coarse[r, c] - fine[r, c]
+                d[2, i, j] = coarsest[r, c] - coarse[r, c]
         v = d[1, 1, 1]
         gx = 0.5 * (d[1, 1, 2] - d[1, 1, 0])
         gy = 0.5 * (d[1, 2, 1] - d[1, 0, 1])
