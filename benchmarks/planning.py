@@ -147,9 +147,15 @@ def sfmapp(*words: str, may_fail: bool = False) -> str:
 
 
 @cache
+def cache_folder() -> tempfile.TemporaryDirectory[str]:
+    """There until this process ends."""
+    return tempfile.TemporaryDirectory(prefix="planning-cache-")
+
+
+@cache
 def environment() -> dict[str, str]:
     """With a cache in which the machine has been measured."""
-    folder = tempfile.mkdtemp(prefix="planning-cache-")
+    folder = cache_folder().name
     given = os.environ | {"PYTHONPATH": str(ROOT / "src"), "XDG_CACHE_HOME": folder}
     given.setdefault("NUMBA_CACHE_DIR", str(Path(folder) / "numba"))
     command = [sys.executable, "-m", "sfmapp", "plan", str(ROOT / "data" / "courtyard" / "images"), "-q"]

@@ -667,6 +667,25 @@ def video_promises(folder: Path) -> Iterator[Promise]:
         yield Promise("video", text, sum(held), len(held), date)
 
 
+def planning_promises(folder: Path) -> Iterator[Promise]:
+    """What is asked of plans, on sets that chose constants of the estimate and on those that did not."""
+    report = read(folder, "planning")
+    date = report["date"][:10]
+    for has_chosen, whose in ((True, "sets that chose constants"), (False, "sets that chose nothing")):
+        rows = [row for row in report["rows"] if row["has_chosen"] == has_chosen]
+        for quantity, what in (("cpu_s", "CPU time"), ("peak_mb", "memory"), ("disk_mb", "disk")):
+            near = sum(abs(row[quantity]["ratio"] - 1.0) <= 0.25 for row in rows)
+            text = f"{what} of a run is within 25 % of its plan, {whose}"
+            yield Promise("planning", text, near, len(rows), date)
+        inside = sum(row["cpu_s"]["is_within"] for row in rows)
+        yield Promise("planning", f"CPU time of a run is inside of its interval, {whose}", inside, len(rows), date)
+    quiet = [row for row in report["rows"] if row["load"] < 1.5]
+    if quiet:
+        near = sum(abs(row["wall_s"]["ratio"] - 1.0) <= 0.25 for row in quiet)
+        text = "time of a run is within 25 % of its plan where nothing else was at work"
+        yield Promise("planning", text, near, len(quiet), date)
+
+
 def town_promises(folder: Path) -> Iterator[Promise]:
     """What is asked of a rendered town: views registered, centres right, and none dearer than those of a small one."""
     report = read(folder, "town")
@@ -858,6 +877,8 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "the same of how many photographs are registered"
     yield Promise("adding", text, sum(row["registered"] >= at_once(row, "registered") for row in rows), len(rows), date)
     yield from town_promises(folder)
+    if (folder / "planning.json").is_file():
+        yield from planning_promises(folder)
     report = read(folder, "odometry")
     same = [row["same_bytes"] for row in report["rows"]]
     yield Promise("odometry", "two runs write the same bytes", sum(same), len(same), report["date"][:10])

@@ -13,7 +13,7 @@ import pytest
 
 import sfmapp
 from sfmapp.cli.main import main
-from sfmapp.errors import NoReconstructionError
+from sfmapp.errors import NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.features.octaves import bytes_of_scale_space
 from sfmapp.images.folder import load_images
@@ -241,6 +241,11 @@ def test_the_command_prints_a_plan_in_words_and_as_json(
 def test_one_photograph_is_no_set(photos: Path, known: machine.Machine) -> None:
     with pytest.raises(NoReconstructionError, match="at least two"):
         sfmapp.plan(str(photos / "*01.png"))
+
+
+def test_a_video_is_no_set_of_photographs() -> None:
+    with pytest.raises(UsageError, match=r"walk\.mp4 is a video"):
+        sfmapp.plan("walk.mp4")
 
 
 def test_the_machine_is_measured_once_and_again_when_it_was_busy(

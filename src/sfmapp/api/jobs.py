@@ -170,6 +170,7 @@ def plan(
         ten, disk, and ``doubts``, each with photographs, what was found, and a remedy.
 
     Raises:
+        UsageError: it is a video, whose frames are not chosen yet.
         InputError: the photographs do not exist or cannot be read.
         NoReconstructionError: fewer than two can be used.
         InterruptedRunError: a stop was asked for.

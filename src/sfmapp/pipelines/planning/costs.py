@@ -43,14 +43,19 @@ _KEPT = 0.65
 _RECORDING = (0.5, 0.006, 0.012)
 # shares of the CPU time of stages that are shared out among the threads, after Amdahl; of the others nothing is
 _PARALLEL = {"features": 0.95, "matching": 0.97, "pairs": 0.9, "mapping": 0.4}
-# bytes of a feature: keypoint, colour and descriptor in memory; with keys in the database; in a model
-_FEATURE_BYTES, _STORED_FEATURE_BYTES, _MODEL_FEATURE_BYTES = 147.0, 152.0, 24.0
+# What choosing pairs takes with all features, of what it took with some
+_MORE_FEATURES = 1.4
+# What the share of linked pairs tells of the others counts as much as so many of them that were tried.
+_PRIOR_PAIRS = 3.0
+# bytes of a feature: keypoint, colour and descriptor in memory, and what is allocated beside them, measured on 16 sets;
+# with keys in the database; in a model
+_FEATURE_BYTES, _STORED_FEATURE_BYTES, _MODEL_FEATURE_BYTES = 250.0, 152.0, 24.0
 # bytes of a verified match, and of a pair; of an observation, and of a point in a model
 _MATCH_BYTES, _PAIR_BYTES, _OBS_BYTES, _POINT_BYTES = 16.0, 300.0, 8.0, 51.0
 # of the recording: a photograph on a screen, in pixels and bytes, and an observation
 _SCREEN_PX, _SCREEN_BYTES, _RECORDED_OBS_BYTES = 6e5, 150e3, 60.0
-# bytes that mapping takes for an observation and for a match, tracks and adjustment together
-_MAPPING_OBS_BYTES, _MAPPING_MATCH_BYTES = 600.0, 40.0
+# bytes that mapping takes for an observation beyond what features leave to it
+_MAPPING_OBS_BYTES = 200.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Given:
 
     Attributes:
         images: of the run.
-        select_cpu_s: that choosing them took, with features of small versions.
+        select_cpu_s: that choosing its pairs took, with features of small versions.
     """
 
     images: Sequence[ImageRecord]
@@ -136,9 +141,10 @@ def _num_overlapping(given: Given) -> Interval:
     """Pairs of the run that overlap: those that small versions show, and as many of the others as the trial found."""
     linked, others = int(given.links.is_linked.sum()), int((~given.links.is_linked).sum())
     seen = [pair.num_matches > 0 for pair, is_linked in _tried(given) if not is_linked]
-    # of a few nobody knows whether there are none
-    share = (sum(seen) + 0.2) / (len(seen) + 1.0)
-    spread = _SIGMAS * math.sqrt(share * (1.0 - share) / (len(seen) + 1.0)) + 0.5 / (len(seen) + 1.0)
+    # those that were tried are the least alike, and where most pairs are linked the others overlap as well, by little
+    num = len(seen) + _PRIOR_PAIRS
+    share = (sum(seen) + _PRIOR_PAIRS * linked / max(1, linked + others)) / num
+    spread = _SIGMAS * math.sqrt(share * (1.0 - share) / num) + 0.5 / num
     high = linked + others * min(1.0, share + spread)
     scale = given.links.scale
     return Interval(0.85 * linked * scale, (linked + others * share) * scale, high * scale)
@@ -209,10 +215,9 @@ def _pixels(record: ImageRecord, options: FeatureOptions) -> float:
 
 
 def _pairs_cpu(given: Given) -> Interval:
-    """Choosing pairs took so long with a few features of each image; it takes in proportion to their number."""
-    used = min(given.options.pairs.num_query_features, given.options.features.max_num_features)
-    in_small = max(1.0, float(np.mean([max(1, n) for n in given.trial.num_features.values()] or [1])))
-    return Interval.about(given.select_cpu_s * max(1.0, min(used, in_small) / 600.0), 0.5, 1.0)
+    """Choosing pairs took so long with a few features of each image; half of that is the vocabulary, whose size is the
+    same with all of them."""
+    return Interval.about(_MORE_FEATURES * given.select_cpu_s, 0.5, 1.0)
 
 
 def _matching_cpu(given: Given) -> Interval:
@@ -284,13 +289,12 @@ def _memory(given: Given, num_features: Interval, matches: Interval, observation
     kept = num_features.likely * _FEATURE_BYTES
     found = matches.likely * _MATCH_BYTES + given.links.num_all * _PAIR_BYTES
     scratch = at_once  # the workers' memory is not given back to the system
-    mapping = observations.likely * _MAPPING_OBS_BYTES + matches.likely * _MAPPING_MATCH_BYTES
     peaks = {
         "images": 0.0,
         "features": at_once + kept,
         "pairs": scratch + kept,
         "matching": scratch + kept + found,
-        "mapping": max(scratch + kept + found, 0.2 * kept + found + mapping),
+        "mapping": scratch + kept + found + observations.likely * _MAPPING_OBS_BYTES,
     }
     return {name: Interval.about(program + extra / 1e6, 0.15) for name, extra in peaks.items()}
 

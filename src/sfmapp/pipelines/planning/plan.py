@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfmapp.errors import NoReconstructionError
+from sfmapp.errors import NoReconstructionError, UsageError
 from sfmapp.events import Events
 from sfmapp.georeference.sources import with_positions
 from sfmapp.images.load import Images, load_images, name_of
+from sfmapp.images.video import is_video
 from sfmapp.matching.pairs import select_pairs
 from sfmapp.pipelines.planning.costs import Estimate, Given, estimate
 from sfmapp.pipelines.planning.doubts import find_doubts
@@ -63,11 +64,17 @@ def plan(
         watch: started earlier, if more is to be counted than this call.
 
     Raises:
+        UsageError: it is a video.
         InputError: the photographs do not exist or cannot be read.
         NoReconstructionError: fewer than two can be used.
         InterruptedRunError: ``events`` was asked to stop.
     """
     options, events, watch = with_absolute_paths(options or Options()), events or Events(), watch or Stopwatch()
+    if isinstance(images, str | os.PathLike) and is_video(os.fspath(images)):
+        raise UsageError(
+            f"{os.fspath(images)} is a video: expected photographs, as its frames are not known before they are chosen",
+            "reconstruct it; or plan for the frames in OUT/images of a reconstruction of it",
+        )
     image_set, found = load_images(images, options.images, events, threads=options.num_workers)
     image_set = with_positions(image_set, options.gps)
     if len(image_set.images) < 2:
