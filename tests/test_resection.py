@@ -58,6 +58,29 @@ def test_unknown_focal_is_found_to_the_grid(scale):
     assert pose_error(found.cam_from_world, pose)[0] < 2.0
 
 
+@pytest.mark.parametrize("kind", ["plane", "rays"])
+def test_a_pose_that_enough_agree_with_is_the_same_where_fewer_are_of_no_use(kind):
+    for seed in range(6):
+        rng, _, xyz, x = some_view(seed, 160)
+        x = x + rng.normal(0, 1e-3, x.shape)
+        outlier = np.arange(160) >= (48, 60, 100)[seed % 3]  # 30, 38 and 63 per cent are right
+        x[outlier] = rng.uniform(-0.5, 0.5, (outlier.sum(), 2))
+        if kind == "rays":
+            x = resection._rays(x)
+        found, bounded = (resection.estimate_pose(xyz, x, 4e-3, min_inliers=least) for least in (4, 40))
+        assert found.is_inlier[~outlier].mean() > 0.9
+        np.testing.assert_array_equal(found.cam_from_world, bounded.cam_from_world)
+        np.testing.assert_array_equal(found.is_inlier, bounded.is_inlier)
+
+
+def test_samples_end_where_a_pose_that_is_of_use_would_have_been_drawn():
+    # four right ones of a sample, nine tenths of a share: 1 - (1 - (0.9 w)^4)^n = 0.9999
+    assert resection._enough_samples(0.5, 0.9999) == 220
+    assert resection._enough_samples(0.25, 0.9999) == 3590
+    assert resection._enough_samples(1.0, 0.9999) == resection._enough_samples(2.0, 0.9999) == 100
+    assert resection._enough_samples(0.01, 0.9999) > 10_000
+
+
 def test_too_little_is_no_pose():
     _, _, xyz, x = some_view(1)
     assert resection.estimate_pose(xyz[:3], x[:3], 1e-2) is None

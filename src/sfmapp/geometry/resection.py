@@ -33,6 +33,11 @@ class Resection:
         return int(self.is_inlier.sum())
 
 
+# Samples end where a pose that enough agree with would have been drawn: with so much less, as the last step of OpenCV's
+# loop, EPnP over the inliers, gains some; and never before so many samples, of which some are degenerate.
+_BEFORE_REFINED, _LEAST_SAMPLES = 0.9, 100
+# Points of a sample of OpenCV's loop, which tells four poses of three apart by a fourth.
+_SAMPLE_SIZE = 4
 # A pose of all inliers that fewer of them agree with than this share of a sample's is no refinement of it.
 _LEAST_KEPT = 0.8
 
@@ -43,7 +48,7 @@ three points or more of which none is wrong (:mod:`sfmapp.geometry.pnp`)."""
 
 def estimate_pose(
     xyz: Array, normalized: Array, max_error: float, *, confidence: float = 0.9999, max_iterations: int = 10_000,
-    method: PoseMethod = "p3p",
+    min_inliers: int = 4, method: PoseMethod = "p3p",
 ) -> Resection | None:  # fmt: skip
     """Pose from 3D-2D correspondences by RANSAC over P3P (Fischler and Bolles, CACM 1981; OpenCV's loop), or from all.
 
@@ -56,6 +61,8 @@ def estimate_pose(
         max_error: largest distance of an inlier in the normalised image plane, or on the unit sphere.
         confidence: wanted probability that one all-inlier sample was drawn.
         max_iterations: bound on the number of samples.
+        min_inliers: a pose that fewer agree with is of no use, and need not be found. It does not change one that more
+            agree with: that many samples would have been drawn for it.
         method: whether some of the points may be wrong.
 
     Returns:
@@ -68,6 +75,7 @@ def estimate_pose(
     valid = np.flatnonzero(~np.isnan(normalized[:, 0]))
     if len(valid) < 4:
         return None
+    max_iterations = min(max_iterations, _enough_samples(min_inliers / len(valid), confidence))
     if normalized.shape[1] == 3:
         pose = p3p.find_pose(xyz[valid], normalized[valid], max_error, confidence, max_iterations)
         if pose is None:
@@ -89,8 +97,17 @@ def estimate_pose(
         error = np.linalg.norm(in_camera[:, :2] / in_camera[:, 2:] - normalized, axis=1)
     is_inlier = (in_camera[:, 2] > 0) & (error <= max_error)  # False for NaN
     if is_inlier.sum() < _LEAST_KEPT * len(sampled):  # the loop ends in EPnP over its inliers, which can lose a plane
-        return estimate_pose(xyz, _rays(normalized), max_error, confidence=confidence, max_iterations=max_iterations)
+        return estimate_pose(
+            xyz, _rays(normalized), max_error, confidence=confidence, max_iterations=max_iterations,
+            min_inliers=min_inliers,
+        )  # fmt: skip
     return Resection(pose, is_inlier) if is_inlier.sum() >= 4 else None
+
+
+def _enough_samples(share: float, confidence: float) -> int:
+    """How many samples hold one of inliers alone with the given confidence, where so large a share of all agrees."""
+    of_inliers = min(_BEFORE_REFINED * share, 1.0 - 1e-9) ** _SAMPLE_SIZE
+    return max(_LEAST_SAMPLES, int(np.ceil(np.log(1.0 - confidence) / np.log1p(-of_inliers))))
 
 
 def _rays(normalized: Array) -> Array:

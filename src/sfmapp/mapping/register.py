@@ -142,13 +142,13 @@ def register_image(
         )  # fmt: skip
     camera = reconstruction.cameras[reconstruction.image_camera_idx[image_idx]]
     xyz = reconstruction.point_xyz[tracks.obs_track_idx[obs]]
-    max_error = max_error_px / camera.focal
+    max_error, needed = max_error_px / camera.focal, _needed_inliers(len(obs), options)
     if search_focal:
         normalized = pixels_to_normalized(camera, tracks.obs_xy[obs])
         found = resection.estimate_pose_and_focal(xyz, normalized, max_error, FOCAL_SCALES)
     else:
-        found = resection.estimate_pose(xyz, bearings([camera], [tracks.obs_xy[obs]])[0], max_error)
-    needed = _needed_inliers(len(obs), options)
+        rays = bearings([camera], [tracks.obs_xy[obs]])[0]
+        found = resection.estimate_pose(xyz, rays, max_error, min_inliers=needed)
     if found is None or found.num_inliers < needed:
         num_inliers = found.num_inliers if found is not None else 0
         reason = f"{num_inliers} of {len(obs)} points agree with one pose, at least {needed} are needed"
