@@ -647,8 +647,8 @@ class Promise:
 def video_promises(folder: Path) -> Iterator[Promise]:
     """What is asked of frames that are chosen of videos, beside as many at equal distances, and beside pycolmap."""
     report = read(folder, "video")
-    date, rows = report["date"][:10], {(row["case"], row["how"], row["who"]): row for row in report["rows"]}
-    films = [case for case, how, who in rows if (how, who) == ("chosen", "sfmapp")]
+    date, rows = report["date"][:10], {(row["film"], row["how"], row["who"]): row for row in report["rows"]}
+    films = [film for film, how, who in rows if (how, who) == ("chosen", "sfmapp")]
     chosen = {film: rows[film, "chosen", "sfmapp"] for film in films}
     text = "of frames chosen of a video, 98 % are registered in one model"
     held = [row.get("registered", 0) >= 0.98 * row["num"] for row in chosen.values()]

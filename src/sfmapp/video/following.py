@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 _NUM_POINTS, _MIN_DISTANCE_PX = 300, 12.0
 # Fewer tell nothing of a motion.
-MIN_POINTS = 20
+MIN_POINTS = 12
 # Patches that look less alike are others (see ``odometry/frontend/active_tracks.py``).
 _MIN_LIKENESS = 0.6
 # A share of the points that has to be found in the next frame: less are chance.

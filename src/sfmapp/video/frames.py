@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -221,7 +222,7 @@ def _left_out(rows: Sequence[FrameRow]) -> list[LeftFrames]:
     counts: Counter[str] = Counter()
     for row in rows:
         if not row.is_taken:
-            reason = row.why.split(" frame ")[0] if row.why.startswith(("less", "repeats")) else row.why
+            reason = re.sub(r"frame \d+", "another frame", row.why)
             first.setdefault(reason, row.time_s)
             counts[reason] += 1
     return [LeftFrames(reason=name, count=n, first_s=round(first[name], 3)) for name, n in counts.most_common()]

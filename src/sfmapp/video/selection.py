@@ -30,9 +30,9 @@ _WORTH_OF_PLACE = 0.15
 _BLURRED, _NUM_RECENT = 0.7, 30
 # The first frame of a stretch is the sharpest of so many, while they show much the same.
 _NUM_FIRST, _NEAR_FIRST = 15, 0.3
-# Share of the points that is left where they are as good as gone. A camera that stands still loses points to whatever
-# passes, which tells nothing: it takes a motion of this share of the longer side.
-_FEW_LEFT, _MOVES = 0.4, 0.01
+# Share of the points that is left where they are as good as gone. Points are also lost to whatever passes a camera that
+# stands, and to noise where there is little to see, which tells nothing: it takes this share of the wanted distance.
+_FEW_LEFT, _COME = 0.4, 0.35
 # Frames after a break that show one thing, before it is believed that the video was cut.
 _NUM_AFTER_CUT = 3
 
@@ -186,12 +186,11 @@ class Selector(Generic[Held]):
         """How far the camera has come, 1 where a frame is wanted, and by what that is told."""
         assert self._main is not None
         left = self._main.share_left
-        moves = apart.flow > _MOVES
         told = {
             "parallax": apart.parallax / self.options.parallax,
             "overlap": (1 - apart.overlap) / (1 - self.options.overlap),
-            "points lost": (1 - left) / (1 - _FEW_LEFT) if moves else 0.0,
         }
+        told["points lost"] = (1 - left) / (1 - _FEW_LEFT) if max(told.values()) >= _COME else 0.0
         if len(self._main.xy) < 1.5 * MIN_POINTS and left < 1 - _FEW_LEFT:
             told["points lost"] = max(told["points lost"], _CLOSE_OF_BLURRED)
         why = max(told, key=lambda name: told[name])
@@ -222,7 +221,7 @@ class Selector(Generic[Held]):
         if best is None:
             return
         for row in self._waiting:
-            row.why = f"less sharp, or less well placed, than frame {best.row.number}"
+            row.why = f"less sharp than frame {best.row.number}, or less well placed"
         why = ("first after a break" if self.breaks else "first") if self._is_first else best.why
         among = f", sharpest of {len(self._waiting)}" if len(self._waiting) > 1 else ""
         best.row.is_taken, best.row.why = True, why + among
