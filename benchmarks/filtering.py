@@ -73,6 +73,7 @@ def main() -> None:
     for number in args.only or range(FIRST_FLIGHT, FIRST_FLIGHT + args.flights):
         by_number[number] = fly(number, args.frames) | {"commit": machine["commit"]}
         runs = [by_number[n] for n in sorted(by_number)]
+        judge_by_others(runs)
         args.output.write_text(json.dumps(machine | {"runs": runs}, indent=1) + "\n")
         print(json.dumps(by_number[number]), flush=True)
     args.output.with_suffix(".md").write_text(table(runs))
@@ -232,16 +233,15 @@ def ate(
     return out
 
 
-def worth(runs: list[dict[str, Any]], number: int) -> list[float]:
-    """The 95 % interval of a flight's NIS, by how many independent innovations those of the others are worth."""
-    others = [
-        run["filter"]["spread"] * run["filter"]["lasts_frames"]
-        for run in runs
-        if "filter" in run and run["flight"] != number
-    ]
-    num = next(run["filter"]["num"] for run in runs if run["flight"] == number)
-    freedom = 6.0 * num / max(1.0, float(np.median(others)))
-    return [float(bound) for bound in chi2.ppf([0.025, 0.975], freedom) / freedom]
+def judge_by_others(runs: list[dict[str, Any]]) -> None:
+    """Add to each flight the 95 % interval of its NIS, by how many independent innovations those of the others are
+    worth."""
+    flown = [run for run in runs if "filter" in run]
+    share = {run["flight"]: run["filter"]["spread"] * run["filter"]["lasts_frames"] for run in flown}
+    for run in flown:
+        others = [value for number, value in share.items() if number != run["flight"]]
+        freedom = 6.0 * run["filter"]["num"] / max([1.0, *([float(np.median(others))] if others else [])])
+        run["filter"]["worth_bounds"] = np.round(chi2.ppf([0.025, 0.975], freedom) / freedom, 3).tolist()
 
 
 def table(runs: list[dict[str, Any]]) -> str:
@@ -258,7 +258,7 @@ def table(runs: list[dict[str, Any]]) -> str:
             lines.append(f"| {run['flight']} | {run['frames']} | {run['cameras']} | {run['failure']}{' |' * 11}")
             continue
         ours, other, (low, high) = run["filter"], run["taken for new"], run["filter"]["bounds"]
-        least, most = worth(runs, run["flight"])
+        least, most = ours["worth_bounds"]
         naive = ("-", "-") if other is None else (f"{other['nis']:.2f}", f"{other['nees']:.0f}")
         lines.append(
             f"| {run['flight']}{'*' * (run['flight'] in CHOSE)} | {run['frames']} | {run['cameras']} "

@@ -787,11 +787,27 @@ def promises(folder: Path) -> Iterator[Promise]:
     text = "live, the last third of a run holds at most 20 MB more than the second"
     flat = [run["memory_mb"][2] - run["memory_mb"][1] <= 20.0 for run in live]
     yield Promise("live", text, sum(flat), len(flat), report["date"][:10])
+    report = read(folder, "long_walk")
+    settled = next(row["memory_mb"] for row in report["curve"] if row["frame"] >= 2000)
+    text = "a walk of 10,000 frames holds at most 300 MB more in the end than at frame 2,000"
+    yield Promise("long_walk", text, int(report["end_memory_mb"] - settled <= 300.0), 1, report["date"][:10])
+    text = "all that comes after the last frame of 10,000 takes at most 60 CPU s"
+    yield Promise("long_walk", text, int(report["end_cpu_s"] <= 60.0), 1, report["date"][:10])
     report = read(folder, "filtering")
     flown = [run for run in report["runs"] if "filter" in run]
-    text = "live poses filtered with an IMU: NIS of a flight within its 95 % bounds"
-    told = [run["filter"]["bounds"][0] <= run["filter"]["nis"] <= run["filter"]["bounds"][1] for run in flown]
-    yield Promise("filtering", text, sum(told), len(told), report["date"][:10])
+    for name, of_what in (
+        ("bounds", "independent innovations"),
+        ("worth_bounds", "as many as those of others are worth"),
+    ):
+        text = f"live poses filtered with an IMU: NIS of a flight within the 95 % interval of {of_what}"
+        told = [run["filter"][name][0] <= run["filter"]["nis"] <= run["filter"][name][1] for run in flown]
+        yield Promise("filtering", text, sum(told), len(told), report["date"][:10])
+    text = "live poses filtered with an IMU: innovations of a flight are white from frame to frame"
+    white = [abs(run["filter"]["neighbours"]) <= run["filter"]["white"] for run in flown]
+    yield Promise("filtering", text, sum(white), len(white), report["date"][:10])
+    text = "live poses filtered with an IMU: a flight's ATE is below that of live poses"
+    nearer = [run["ate_mm"]["filtered"] < run["ate_mm"]["live"] for run in flown]
+    yield Promise("filtering", text, sum(nearer), len(nearer), report["date"][:10])
     text = "live poses filtered with an IMU: NEES of a flight below 2"
     stated = [run["filter"]["nees"] < 2.0 for run in flown]
     yield Promise("filtering", text, sum(stated), len(stated), report["date"][:10])
