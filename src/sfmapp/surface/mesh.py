@@ -58,7 +58,7 @@ def make_mesh(
     patches = make_patch_cloud(xyz, normal, rgb, size, threads)
     depth = options.depth or depth_for(xyz, patches.median_spacing)
     events.advanced(STAGE, message=f"Poisson, depth {depth}")
-    surface = poisson(xyz, normal, depth, events)
+    surface = poisson(xyz, normal, depth, events, stage=STAGE)
     events.advanced(STAGE, message="trimming")
     around = look_around(surface.xyz, vertex_normals(surface.xyz, surface.faces), patches, threads)
     events.advanced(STAGE)

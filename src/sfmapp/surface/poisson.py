@@ -50,7 +50,12 @@ def depth_for(xyz: NDArray[np.float64], spacing: float) -> int:
 
 
 def poisson(
-    xyz: NDArray[np.float64], normal: NDArray[np.float32], depth: int, events: Events | None = None
+    xyz: NDArray[np.float64],
+    normal: NDArray[np.float32],
+    depth: int,
+    events: Events | None = None,
+    *,
+    stage: str | None = None,
 ) -> ClosedSurface:
     """Reconstruct the surface in a child process.
 
@@ -59,6 +64,7 @@ def poisson(
         normal: (N, 3) outward; their lengths do not matter.
         depth: of the octree.
         events: cancellation; the child is killed.
+        stage: which is told every two seconds how long it takes; None: nobody is told.
 
     Raises:
         NoReconstructionError: fewer than 50 points, or the child ended without a surface (the message says how).
@@ -77,7 +83,8 @@ def poisson(
     arrays = {"xyz": ((xyz - center) / scale).astype(np.float32), "normal": np.asarray(normal, np.float32)}
     module = "sfmapp.surface.poisson_child"
     found, usage = run_child(
-        module, "Poisson reconstruction", arrays, (depth, BOX_SCALE, THREADS), ADVICE, events or Events()
+        module, "Poisson reconstruction", arrays, (depth, BOX_SCALE, THREADS), ADVICE, events or Events(),
+        stage=stage,
     )  # fmt: skip
     if len(found["faces"]) == 0:
         raise NoReconstructionError("Poisson reconstruction: found no surface", ADVICE)

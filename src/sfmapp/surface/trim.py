@@ -52,14 +52,16 @@ def look_around(
 
 def in_view(xyz: NDArray[np.float64], faces: NDArray[np.int32], scene: DenseScene) -> NDArray[np.bool_]:
     """(F,) bool, True for faces of which a view shows the centre, and their front. What hides what is not asked."""
-    vectors = face_vectors(xyz, faces)
-    centers = xyz[faces].mean(axis=1)
     seen = np.zeros(len(faces), np.bool_)
-    for view, camera in zip(scene.views, scene.centers, strict=True):
-        open_idx = np.flatnonzero(~seen)
-        pixel, _ = view.project(centers[open_idx])
-        faces_camera = np.einsum("fc,fc->f", centers[open_idx] - camera, vectors[open_idx]) < 0.0
-        seen[open_idx[view.shows(pixel) & faces_camera]] = True
+    for start in range(0, len(faces), CHUNK):
+        some = faces[start : start + CHUNK]
+        vectors, centers, idx = face_vectors(xyz, some), xyz[some].mean(axis=1), np.arange(len(some))
+        for view, camera in zip(scene.views, scene.centers, strict=True):
+            pixel, _ = view.project(centers[idx])
+            faces_camera = np.einsum("fc,fc->f", centers[idx] - camera, vectors[idx]) < 0.0
+            shown = view.shows(pixel) & faces_camera
+            seen[start + idx[shown]] = True
+            idx = idx[~shown]
     return seen
 
 
