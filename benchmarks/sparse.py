@@ -11,6 +11,7 @@ and swap the order from seed to seed. See README.md for what the numbers mean.
 from __future__ import annotations
 
 import argparse
+import compileall
 import json
 import os
 import shutil
@@ -22,6 +23,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import sfmapp
 from machine import RESULTS, ROOT, describe_machine
 from sfmapp.errors import SfmError
 from sfmapp.evaluation.measured import ProcessUsage, run_measured
@@ -82,9 +84,6 @@ def run_sfmapp(data: DataSet, seed: int, work: Path, args: argparse.Namespace) -
     command += ["--threads", str(args.threads)] if args.threads else []
     command += [flag for setting in args.set for flag in ("--set", setting)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(args.numba_cache)}
-    # byte code is kept as pip does when it installs, and as it is there of pycolmap
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    environment["PYTHONPYCACHEPREFIX"] = str(args.numba_cache / "bytecode")
     usage = run_measured(command, work / "sfmapp.log", env=environment)
     if usage.exit_code not in (0, 4):
         tail = (work / "sfmapp.log").read_text(errors="replace")[-2000:]
@@ -251,6 +250,8 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=None, help="folder for the workspaces, which are removed again")
     parser.add_argument("-o", "--output", type=Path, default=None, help="default: benchmarks/results/sparse.json")
     args = parser.parse_args()
+    # what pip does when it installs; both programs run modules of ours, and Python may have been told to keep nothing
+    compileall.compile_dir(Path(sfmapp.__file__).parent, quiet=1)
     args.numba_cache = Path(tempfile.mkdtemp(prefix="numba-", dir=args.work))
     report: dict[str, Any] = environment(args) | {"runs": []}
     output = args.output or RESULTS / "sparse.json"
