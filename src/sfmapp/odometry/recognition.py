@@ -16,6 +16,7 @@ from sfmapp.odometry.loops.detection import LoopClosure, LoopFinder
 from sfmapp.odometry.loops.place_recognition import PlaceIndex
 from sfmapp.odometry.loops.place_recognition import View as PlaceView
 from sfmapp.odometry.loops.relocalize import Relocalization, RelocalizeOptions, relocalize
+from sfmapp.odometry.loops.rivals import believe_place
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.map.local_map import LocalMap, View
 from sfmapp.odometry.records import FrameRecord
@@ -182,7 +183,8 @@ class Recognition:
         return kept, float(joined.kept_from_absorbed[7]) if newest is absorbed else 1.0
 
     def find(self, maps: dict[int, LocalMap], view: View) -> tuple[LocalMap, int, Array, Ids, Array] | None:
-        """Find a lost frame in any of the maps; in a known one where :class:`PlaceBelief` is certain.
+        """Find a lost frame in any of the maps, where it is certain not to be at the like of its place; in a known one
+        where :class:`PlaceBelief` is certain.
 
         Returns:
             The map, the frame that it looks like, the pose (7,), and the points seen: ids (N,) and pixels (N, 2).
@@ -198,13 +200,14 @@ class Recognition:
             self._num_searches += 1
         self._num_waited = (self._num_waited + 1) % _OPEN if is_open else 0
         roll = math.radians(_ROLLS_DEG[(self._num_searches - 1) % 3])
-        seen, found = PlaceView(view.images[0], corners), None
+        seen, found, options = PlaceView(view.images[0], corners), None, RelocalizeOptions()
         if self.belief is not None:
             known = keyframes.pop(self.belief.map_idx)
             if self._num_waited == 0:
                 found = self._find_known(known, seen, roll)
         if found is None:
-            found = relocalize(keyframes, self._places, seen, RelocalizeOptions(), roll)
+            fitting = relocalize(keyframes, self._places, seen, options, roll)
+            found = believe_place(fitting, keyframes, self._places, seen, view.timestamp_s, options)
         if found is None:
             return None
         located = found.located

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.loops.gaps import log_ratio_of_seam, way_of
 from sfmapp.odometry.loops.place_recognition import Candidate, Ids, PlaceIndex, View
 from sfmapp.odometry.loops.pose_graph import keyframe_depths
 from sfmapp.odometry.loops.relocalize import (
@@ -121,9 +122,15 @@ class _Suspicion:
         """Too much is missing where it leads."""
         return self.evidence is not None and self.evidence.is_contradicted
 
-    def is_certain(self, shift: float | None) -> bool:
-        """It does not lead to the like of its place; see :meth:`LoopEvidence.is_certain`."""
-        return self.evidence is None or self.evidence.is_certain(shift)
+    def is_certain(self, keyframes: KeyframeMap, old_map: KeyframeMap) -> bool:
+        """It does not lead to the like of its place."""
+        if self.evidence is None:
+            return True
+        view = self.views[-1]
+        if old_map is keyframes:
+            return self.evidence.is_certain_by_drift(self.shift(keyframes) / keyframe_depths(keyframes)[view.new_idx])
+        ways, depth = (way_of(old_map), way_of(keyframes, self.old_from_new)), keyframe_depths(old_map)[view.old_idx]
+        return self.evidence.is_certain_by_way(log_ratio_of_seam(*ways, float(depth)))
 
     def shift(self, keyframes: KeyframeMap) -> float:
         """By how much it moves the newest keyframe that saw it."""
@@ -245,9 +252,7 @@ class LoopFinder:
         if self._suspicion is None or num < options.min_views:
             return None
         agrees = bool(np.mean([v.located.agreement for v in trial.views]) >= options.min_agreement)
-        keyframes, newest = maps[map_idx], trial.views[-1].new_idx
-        shift = trial.shift(keyframes) / keyframe_depths(keyframes)[newest] if trial.old_map == map_idx else None
-        is_certain = agrees and trial.is_certain(shift)
+        is_certain = agrees and trial.is_certain(maps[map_idx], maps[trial.old_map])
         if num == options.min_views:
             self.num_open += agrees and not is_certain
         else:  # it has been open

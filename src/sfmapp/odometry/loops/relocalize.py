@@ -110,7 +110,7 @@ class Located:
 
 @dataclass(frozen=True)
 class Relocalization:
-    """Where a lost image is: the map, the keyframe that it looks like, and how it lies there."""
+    """Where a lost image may be: the map, the keyframe that it looks like, and how it lies there."""
 
     map_idx: int
     frame_idx: int
@@ -119,19 +119,20 @@ class Relocalization:
 
 def relocalize(
     maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View, options: RelocalizeOptions, roll: float = 0.0
-) -> Relocalization | None:
-    """Find an image in any of the maps.
+) -> list[Relocalization]:
+    """Places of any of the maps that an image fits, the one that it looks like most first.
 
     Args:
         maps: by the number that they have in ``places``.
         roll: radians by which the image is thought to be turned against the keyframes, from x to y. Descriptors bear
             15 degrees of error, so try 0 and, on other frames, plus and minus 25 degrees.
     """
+    fitting = []
     for candidate in places.query_view(view, roll, maps):
         found = locate(maps[candidate.map_idx], places, view, candidate, options, roll)
         if found is not None and is_convincing(found, view, options):
-            return Relocalization(candidate.map_idx, candidate.frame_idx, found)
-    return None
+            fitting.append(Relocalization(candidate.map_idx, candidate.frame_idx, found))
+    return fitting
 
 
 def is_elsewhere(pose: Array, other: Array, depth: float) -> bool:
