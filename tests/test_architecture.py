@@ -62,7 +62,7 @@ FLOORS = (
 INNER_FLOORS = {
     "odometry": (
         ("run",),
-        ("frames_adjustment", "known_map_check", "recognition", "shutter"),
+        ("frames_adjustment", "known_map_check", "missed_frames", "recognition", "shutter"),
         ("records",),
         ("tracker", "initialize", "stereo_clock"),
         ("refinement",),

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 class FrameState(IntEnum):
     """What became of a frame."""
 
-    WAITING = 0  # seen before a map had begun; has a pose if the map reached back to it
+    WAITING = 0  # no pose at its time; has one if a map that began, or was found again, reached back to it
     TRACKED = 1  # its pose was measured against the map
     RELOCALIZED = 2  # the first one found again after a loss
     LOST = 3  # no pose: a gap in the trajectory

@@ -31,6 +31,7 @@ from sfmapp.odometry.map.atlas import Atlas
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 from sfmapp.odometry.map.known_map import PREFIX, KnownMap, known_keyframes
 from sfmapp.odometry.map.local_map import LocalMap, View
+from sfmapp.odometry.missed_frames import MissedFrames
 from sfmapp.odometry.motion_model import MotionModel
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
@@ -137,7 +138,7 @@ class Odometry:
         self.atlas = Atlas(options, self.executor, None if self.rig.is_stereo else self.imu)
         self.local: LocalMap | None = None  # the map that the camera is in, or was in when it was lost
         self.recognition, self.keyframe_images = Recognition(seed, self.executor), KeyframeImages(markers)
-        self.tracked, self.motion = _Tracked(), MotionModel(sequence.imu)
+        self.tracked, self.motion, self.missed = _Tracked(), MotionModel(sequence.imu), MissedFrames()
         self.residuals = ResidualMemory()
         self.clock = StereoClock(self.rig)
         self.known = None if known is None else self._enter_known_map(known)
@@ -170,6 +171,10 @@ class Odometry:
         record = FrameRecord(frame.idx, frame.name, frame.timestamp_s)
         self.records.append(record)
         self._go_through_phases(record, view)
+        if record.has_pose:
+            self.missed.forget()
+        else:
+            self.missed.note(record, view.pyramids[0])
         if not record.is_twin:  # later ones are compared with the frame that was measured: what is small may add up
             self.tracked.previous = view.pyramids[0]
         record.cpu_s = time.thread_time() - start
@@ -238,6 +243,7 @@ class Odometry:
             return
         self._enter(local, tracks, rigid3.IDENTITY)
         self._settle(record, FrameState.TRACKED, rigid3.IDENTITY, is_keyframe=True)
+        self._reach_back(0)
         self._remember(view)
         self._tell("a map begins with one look of the rig", num_mapped=self.tracked.num_mapped_at_keyframe)
 
@@ -262,6 +268,7 @@ class Odometry:
             before = start if measured is None else measured[0]
             self._settle(record, FrameState.WAITING, before, keyframe=0, tracks=corners.moved(seen[n]).subset(usable))
         self.motion.step = rigid3.compose(self.tracked.pose, rigid3.inverse(before))
+        self._reach_back(0)
         self._remember(last)
         self._tell(
             f"a map begins with two views ({views.config.name.lower()})", median_angle_deg=views.median_angle_deg,
@@ -411,6 +418,7 @@ class Odometry:
         self._begin_to_wait()
         tracked.pose, tracked.tracks = found.pose, found.tracks
         self._make_keyframe(record, view, FrameState.RELOCALIZED, "the tracks are found again")
+        self._reach_back()
         return True
 
     def _find_by_places(self, record: FrameRecord, view: View) -> bool:
@@ -430,6 +438,7 @@ class Odometry:
             seen = self.local.keyframes.keyframes[position_of(self.local.keyframes, frame_idx)]
             reason = f"found in the known map at {seen.name.removeprefix(PREFIX)}"
         self._make_keyframe(record, view, FrameState.RELOCALIZED, reason)
+        self._reach_back()
         return True
 
     def _find_known(self, view: View) -> None:
@@ -448,6 +457,19 @@ class Odometry:
         if record.timestamp_s == self.state.lost_since_s:
             self.events.warned(STAGE, f"{record.name}: tracking is lost", frame_idx=record.frame_idx)
         self.state.wait(record.timestamp_s, self.options.max_lost_s)
+
+    def _reach_back(self, keyframe: int | None = None) -> None:
+        """Give poses to the frames without one that came just before a keyframe, the newest if none is named, as far as
+        they show what it shows."""
+        local = self.local
+        assert local is not None
+        keyframe = local.newest if keyframe is None else keyframe
+        placed = self.missed.reach_back(local, keyframe)
+        for frame in placed:
+            self._settle(frame.record, FrameState.WAITING, frame.pose, keyframe=keyframe, tracks=frame.tracks)
+        if placed:
+            message = f"{len(placed)} frames without a pose are followed back"
+            self.events.decided(STAGE, message, num_frames=len(placed), frame_idx=placed[-1].record.frame_idx)
 
     # ------------------------------------------------------------------ what is noted and told
 

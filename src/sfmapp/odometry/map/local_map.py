@@ -141,13 +141,16 @@ class LocalMap:
     def tracks_of_newest(self) -> ActiveTracks:
         """The tracks that the newest keyframe saw, looked for as it saw them from now on: the map has changed."""
         keyframe, number = self.keyframes.keyframes[-1], self.newest
-        good = keyframe.is_inlier[:, 0]
-        point_id, xy = keyframe.point_id[good], keyframe.xy[good, 0]
-        mapped = self.keyframes.is_triangulated(point_id)
-        known = self.tracks_at(point_id[mapped], xy[mapped], keyframe.rig_from_world)
-        known = replace(known, reference=np.full(len(known), number))
-        guessed = self._tracks(point_id[~mapped], xy[~mapped], number, known)
-        return known.joined(guessed)
+        known = self.mapped_tracks_of(number)
+        guessed = keyframe.is_inlier[:, 0] & ~self.keyframes.is_triangulated(keyframe.point_id)
+        return known.joined(self._tracks(keyframe.point_id[guessed], keyframe.xy[guessed, 0], number, known))
+
+    def mapped_tracks_of(self, position: int) -> ActiveTracks:
+        """The points of the map that a keyframe saw, looked for as it saw them."""
+        keyframe = self.keyframes.keyframes[position]
+        mapped = keyframe.is_inlier[:, 0] & self.keyframes.is_triangulated(keyframe.point_id)
+        known = self.tracks_at(keyframe.point_id[mapped], keyframe.xy[mapped, 0], keyframe.rig_from_world)
+        return replace(known, reference=np.full(len(known), position))
 
     def tracks_at(self, point_id: NDArray[np.int64], xy: Array, pose: Array) -> ActiveTracks:
         """Tracks of points (N,), ascending, seen at pixels (N, 2) of a frame that is to become the next keyframe."""
