@@ -198,10 +198,15 @@ def run_peer(case: Case, work: Path, args: argparse.Namespace) -> dict[str, Any]
     return values | {"ground_truth": against(trajectory, ground_truth, "sim3")}
 
 
-def run_orb_slam3(case: Case, work: Path) -> dict[str, Any]:
-    """ORB-SLAM3, its start and the loading of its vocabulary included; with a scale of its own for one camera."""
+def run_orb_slam3(case: Case, work: Path, slow: float = 1.0) -> dict[str, Any]:
+    """ORB-SLAM3, its start and the loading of its vocabulary included; with a scale of its own for one camera.
+
+    Args:
+        slow: how many times slower than the sequence it gets its frames.
+    """
     out, is_mono = work / "orb_slam3.txt", "--mono" in case.flags
     command = [sys.executable, str(ROOT / "benchmarks" / "orb_slam3.py"), str(case.sequence), str(out)]
+    command += ["--slow", f"{slow:g}"]
     usage = run_measured([*command, *(["--mono"] if is_mono else [])], work / "orb_slam3.log")
     sequence = open_sequence(case.sequence, SequenceOptions(mono=is_mono), Events())
     count = sequence.num_frames or 0

@@ -90,6 +90,7 @@ def rows_of(folder: Path) -> list[Row]:
         "town": town_rows,
         "dense": dense_rows,
         "odometry": odometry_rows,
+        "handheld": handheld_rows,
         "calibration": calibration_rows,
         "two_views": two_view_rows,
         "known_points": known_point_rows,
@@ -630,6 +631,31 @@ def odometry_rows(folder: Path) -> Iterator[Row]:
             yield Row(
                 "odometry", row["case"], quantity, unit, better, value, "", None, False, report["date"][:10],
                 report["commit"],
+            )  # type: ignore[arg-type]  # fmt: skip
+
+
+def handheld_rows(folder: Path) -> Iterator[Row]:
+    """``sfmapp odometry`` beside ORB-SLAM3 on hand-held sequences of a rendered room."""
+    report = read(folder, "handheld")
+    theirs = {row["case"]: row for row in report["rows"] if row["program"] != "sfmapp"}
+
+    def figures(row: dict[str, Any] | None) -> tuple[float | None, float | None, float | None]:
+        if row is None:
+            return None, None, None
+        truth = row["ground_truth"]
+        ate = None if truth is None else 1000 * truth["ate_m"]["rmse"]
+        return 100 * row["num_in_largest_map"] / row["num_frames"], ate, row["process_cpu_ms_per_frame"]
+
+    for row in report["rows"]:
+        if row["program"] != "sfmapp":
+            continue
+        peer = theirs.get(row["case"])
+        named = (("frames with a pose", "%", "more"), ("ATE, rmse", "mm", "less"), ("CPU time a frame", "ms", "less"))
+        for (quantity, unit, better), value, other in zip(named, figures(row), figures(peer), strict=True):
+            assert value is not None
+            yield Row(
+                "handheld", row["case"], quantity, unit, better, value, "" if peer is None else "ORB-SLAM3", other,
+                False, report["date"][:10], report["commit"],
             )  # type: ignore[arg-type]  # fmt: skip
 
 
