@@ -63,7 +63,7 @@ def localised(sequence: Played, known: KnownMap, told: Told | None = None) -> tu
     return found, found.report.known_map
 
 
-def test_a_second_run_is_localised_from_its_first_frame_and_no_worse_than_the_first() -> None:
+def test_a_second_run_is_localised_from_its_first_frame_and_better_than_without_the_map() -> None:
     sequence = backwards()
     found, report = localised(sequence, known_map())
     assert (report.is_found, report.num_localised, report.num_elsewhere) == (True, NUM_FRAMES, 0)
@@ -84,7 +84,8 @@ def test_a_second_run_is_localised_from_its_first_frame_and_no_worse_than_the_fi
     error, metres_per_unit = absolute_error(found, sequence)
     first = first_run()
     first_error = absolute_error(first, room(NUM_FRAMES))[0]
-    assert error < first_error
+    alone = run_odometry(sequence, OdometryOptions(), threads=2)  # type: ignore[arg-type]
+    assert error < 0.6 * absolute_error(alone, sequence)[0]
     # in the frame and the unit of the first: its poses of the same places, without any alignment
     between = rigid3.center(found.cam_from_world) - rigid3.center(first.cam_from_world[::-1])
     assert metres_per_unit * np.sqrt((between**2).sum(1).mean()) < 2.0 * (error + first_error)

@@ -554,7 +554,9 @@ class Odometry:
             conclusion.contradictions.extend(self.clock.contradictions(local.keyframes))
             conclusion.contradictions.extend(local.witnesses.contradictions(local.keyframes))
             measure_again(self.records, local.keyframes, number)
-            num_frames = None if is_known else self._adjust_frames(local, conclusion)
+            num_frames = self._adjust_frames(local, conclusion)
+            if num_frames and is_known:
+                self._restore_known_frame(local)
             report = replace(conclusion.report, shutter=straightened, num_frames=num_frames)
             conclusions[number] = replace(conclusion, report=report)
             self.events.finished("adjustment", **conclusions[number].report)
@@ -593,6 +595,16 @@ class Odometry:
         self.known.lay_onto(local.keyframes, together)
         conclusion.contradictions.append(found)
         return conclusion
+
+    def _restore_known_frame(self, local: LocalMap) -> None:
+        """Bring the known map, and what hangs on it, back to where it was and to its size."""
+        assert self.known is not None
+        before = rigid3.spread(np.array([k.rig_from_world for k in local.keyframes.keyframes]))
+        self.known.restore_frame(local.keyframes)
+        zoom = rigid3.spread(np.array([k.rig_from_world for k in local.keyframes.keyframes])) / max(before, 1e-300)
+        for record in self.records:
+            if record.map_idx == local.map_idx and record.has_pose:
+                record.frame_from_keyframe[4:] *= zoom
 
     def _adjust_frames(self, local: LocalMap, conclusion: FinalAdjustment) -> int | None:
         """Adjust the frames between the keyframes with them, where images of one camera alone hold the map; how many
