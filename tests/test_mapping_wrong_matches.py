@@ -42,8 +42,13 @@ def test_observations_at_wrong_places_are_rejected(outlier_ratio: float) -> None
     assert model.is_registered.all()
     is_wrong = of_observations(model, scene, scene.obs_is_outlier)
     assert is_wrong.mean() == pytest.approx(outlier_ratio, rel=0.2)  # they were all there
-    # a random pixel is within three pixels of the right place once in ten thousand times
-    assert (model.obs_is_inlier & is_wrong).sum() <= 0.005 * is_wrong.sum()
+    track = model.tracks.obs_track_idx
+    num_inliers = np.bincount(track[model.obs_is_inlier], minlength=model.tracks.num_tracks)[track]
+    is_taken = model.obs_is_inlier & is_wrong
+    # a random pixel is within three pixels of the right place once in ten thousand times; of a point that one other
+    # image alone tells of, it only has to be as near to an epipolar line, a band of six pixels of some 750
+    assert not (is_taken & (num_inliers > 2)).any()
+    assert is_taken.sum() <= 2.0 * 6.0 / 750.0 * is_wrong.sum()
     is_mapped = model.is_triangulated[model.tracks.obs_track_idx]
     assert (model.obs_is_inlier & ~is_wrong).sum() > 0.95 * (is_mapped & ~is_wrong).sum()
     assert is_mapped[~is_wrong].mean() > 0.9

@@ -181,7 +181,7 @@ def test_known_points_make_it_metric(reconstructed: Path, tmp_path: Path) -> Non
     sfmapp.undistort(reconstructed, straight)
     model = sfmapp.load(straight)
     many = np.flatnonzero(np.bincount(model.tracks.obs_track_idx[model.obs_is_inlier]) >= 5)
-    chosen = many[:: len(many) // 12][:12]
+    chosen = many[:: len(many) // 24][:24]
     rows = ["# crs: local", "name,x,y,z,image,px,py"]
     for track in chosen:
         seen = model.observations_of_track(int(track))
