@@ -40,15 +40,14 @@ def links_to(paths: list[Path], folder: Path) -> None:
 
 
 def kitti(folder: Path) -> None:
-    """Every second frame of a drive: more than are compared all with all."""
-    links_to(sorted((DATA / "kitti00-200" / "image_0").iterdir())[::2], folder)
+    """The second half of a drive: more frames than are compared all with all."""
+    links_to(sorted((DATA / "kitti00-200" / "image_0").iterdir())[100:], folder)
 
 
 def two_places(folder: Path) -> None:
-    """A fountain and a castle in one folder."""
-    links_to(
-        [path for name in ("fountain-P11", "herz-jesus-P8") for path in (DATA / name / "images").iterdir()], folder
-    )
+    """A door and a courtyard in one folder."""
+    names = ("lund-door", "strecha-courtyard-21")
+    links_to([path for name in names for path in (DATA / name / "images").iterdir()], folder)
 
 
 def tagged(kind: str, seed: int) -> Callable[[Path], None]:
@@ -69,13 +68,13 @@ def room(folder: Path) -> None:
 
     from rendered_worlds.sequences import room as walk
 
-    sequence = walk(840, seed=5)
+    sequence = walk(840, seed=9)
     for n in range(0, 840, 10):
         cv2.imwrite(str(folder / f"{n:04d}.png"), sequence.image(n))
 
 
 FRESH: dict[str, Callable[[Path], None]] = {
-    "drone block": tagged("drone block", 1), "monument": tagged("monument", 1), "room": room, "kitti00": kitti,
+    "drone block": tagged("drone block", 4), "monument": tagged("monument", 4), "room": room, "kitti00": kitti,
     "two places": two_places,
 }  # fmt: skip
 

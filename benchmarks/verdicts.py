@@ -116,6 +116,7 @@ def rows_of(folder: Path) -> list[Row]:
         "matching": matching_rows,
         "memory": memory_rows,
         "cold_start": first_run_rows,
+        "clusters": cluster_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -136,6 +137,18 @@ def first_run_rows(folder: Path) -> Iterator[Row]:
     for row in report["runs"]:
         what = "CPU time of the first run over that of the second"
         yield Row("cold_start", row["case"], what, "s", "less", row["more_cpu_s"], "", None, *about)
+
+
+def cluster_rows(folder: Path) -> Iterator[Row]:
+    """What workers of dask take more than threads of one process."""
+    report = read(folder, "clusters")
+    about = (False, report["date"][:10], report["commit"])
+    threads = {row["case"]: row["cpu_s"] for row in report["rows"] if not row["workers"]}
+    for row in report["rows"]:
+        if row["workers"] and row["killed_at_step"] is None:
+            case = f"{row['case']}, {row['workers']} local workers"
+            ours, theirs = row["cpu_s"], threads[row["case"]]
+            yield Row("clusters", case, "CPU time", "s", "less", ours, "threads of one process", theirs, *about)
 
 
 def calibration_rows(folder: Path) -> Iterator[Row]:
@@ -761,6 +774,9 @@ def promises(folder: Path) -> Iterator[Promise]:
     runs, date = read(folder, "cold_start")["runs"], read(folder, "cold_start")["date"][:10]
     text = "two cores work off what the first run of a command takes more in 15 s (demo 25 s)"
     yield Promise("cold_start", text, sum(row["more_cpu_s"] <= row["most_more_cpu_s"] for row in runs), len(runs), date)
+    rows, date = read(folder, "clusters")["rows"], read(folder, "clusters")["date"][:10]
+    text = "models by 1, 2 or 4 workers, one of them killed or none, are the bytes of threads"
+    yield Promise("clusters", text, sum(row["is_same"] for row in rows), len(rows), date)
     rows, date = read(folder, "memory")["rows"], read(folder, "memory")["date"][:10]
     text = "SIFT on photographs of 6.8 megapixels takes less than 700 MB on two workers"
     yield Promise("memory", text, sum(row["peak_mb"] < row["most_mb"] for row in rows), len(rows), date)
@@ -880,6 +896,12 @@ def promises(folder: Path) -> Iterator[Promise]:
     yield Promise("loops", text, sum(row["with"]["num_wrong"] == 0 for row in rows), len(rows), date)
     text = "a walk that comes back to where it was closes a loop"
     yield Promise("loops", text, sum(row["with"]["num_right"] > 0 for row in rows), len(rows), date)
+    report = read(folder, "losses")
+    rows, date = report["rows"], report["date"][:10]
+    text = "after a loss no frame is placed surely wrong, in halls of equal bays, rooms, blocks and kitti00-200"
+    yield Promise("losses", text, sum(row["num_wrong"] == 0 for row in rows), len(rows), date)
+    text = "most frames after a loss are in the map of before"
+    yield Promise("losses", text, sum(2 * row["num_right"] > row["num_after"] for row in rows), len(rows), date)
     report = read(folder, "kidnapped")
     rows, date = [row for hall in report["halls"] for row in hall["rows"]], report["date"][:10]
     text = "a camera put down in a hall of look-alikes is where it is believed to be, or undecided; never surely wrong"

@@ -48,7 +48,8 @@ _LEAST_PARALLAX = math.radians(1.0)
 
 # What of a pose that gets less sure is a step for itself in each frame, and not the same error seen from farther off:
 # by seven rendered flights, of two cameras and two sizes of pictures, on which innovations are 0.7 to 1.0 with it, 0.8
-# to 1.2 without and 0.6 to 1.0 with all of it; those beside them are the less correlated the more there is of it.
+# to 1.2 without (but for one whose first map was wrong) and 0.6 to 1.0 with all of it; those beside them are the less
+# correlated the more there is of it.
 _STEPS = 0.5
 
 
