@@ -117,6 +117,7 @@ def rows_of(folder: Path) -> list[Row]:
         "memory": memory_rows,
         "cold_start": first_run_rows,
         "clusters": cluster_rows,
+        "scale": scale_rows,
     }
     return [row for name, make in makers.items() if (folder / f"{name}.json").is_file() for row in make(folder)]
 
@@ -149,6 +150,16 @@ def cluster_rows(folder: Path) -> Iterator[Row]:
             case = f"{row['case']}, {row['workers']} local workers"
             ours, theirs = row["cpu_s"], threads[row["case"]]
             yield Row("clusters", case, "CPU time", "s", "less", ours, "threads of one process", theirs, *about)
+
+
+def scale_rows(folder: Path) -> Iterator[Row]:
+    """Large sets on many workers, simulated with measured costs."""
+    report = read(folder, "scale")
+    about = (False, report["date"][:10], report["commit"])
+    for row in report["rows"]:
+        case = f"{row['images']:,} photographs, {row['workers']} workers, on paper"
+        hours = (row["features_s"] + row["pairs_s"] + row["matching_s"]) / 3600.0
+        yield Row("scale", case, "wall time to verified matches", "h", "less", hours, "", None, *about)
 
 
 def calibration_rows(folder: Path) -> Iterator[Row]:
