@@ -31,7 +31,7 @@ STORAGE_BYTES_S = 1.0e9
 # a worker in a thousand is lost in an hour; its successor begins after two minutes
 LOSSES_PER_H, REPLACED_S = 1e-3, 120.0
 AHEAD = 2
-PHOTO_BYTES, FEATURE_BYTES = 5.0e6, 8192 * (128 + 16 + 3)
+FEATURE_BYTES = 8192 * (128 + 16 + 3)
 PAIRS_PER_UNIT, IMAGES_PER_UNIT = 64, 36
 KEYPOINT_BYTES, MATCH_BYTES = 8192 * (16 + 3), 8
 
@@ -50,6 +50,7 @@ class Costs:
         compare_s: comparing one vector with another.
         pairs_per_image: that are chosen.
         matches_per_pair: verified, the mean.
+        photo_bytes: of the file of a photograph, the mean.
     """
 
     image_s: list[float]
@@ -61,6 +62,7 @@ class Costs:
     compare_s: float
     pairs_per_image: float
     matches_per_pair: float
+    photo_bytes: float
 
 
 @dataclass
@@ -136,7 +138,7 @@ def simulated(num_images: int, workers: int, costs: Costs, seed: int = 0) -> dic
     """One run: features, choice of pairs, matching."""
     rng = np.random.default_rng([seed, num_images, workers])
     features = Cluster(workers, rng).run(
-        rng.choice(costs.image_s, num_images), PHOTO_BYTES, FEATURE_BYTES, costs.unit_s + costs.take_image_s
+        rng.choice(costs.image_s, num_images), costs.photo_bytes, FEATURE_BYTES, costs.unit_s + costs.take_image_s
     )
     num_pairs = round(num_images * costs.pairs_per_image)
     num_units = -(-num_pairs // PAIRS_PER_UNIT)
@@ -152,7 +154,7 @@ def simulated(num_images: int, workers: int, costs: Costs, seed: int = 0) -> dic
         "pairs_s": pairs_s,
         "matching_s": matching.wall_s, "matching_limit": matching.limit(workers),
         "redone": features.num_redone + matching.num_redone,
-        "read_gb": 1e-9 * (num_images * PHOTO_BYTES + num_units * IMAGES_PER_UNIT * FEATURE_BYTES),
+        "read_gb": 1e-9 * (num_images * costs.photo_bytes + num_units * IMAGES_PER_UNIT * FEATURE_BYTES),
         "written_gb": 1e-9 * num_images * FEATURE_BYTES,
         "sent_gb": 1e-9 * match_bytes,
         "client_gb": 1e-9 * (num_images * KEYPOINT_BYTES + match_bytes + 4 * num_images * 8192),
@@ -164,10 +166,12 @@ def simulated(num_images: int, workers: int, costs: Costs, seed: int = 0) -> dic
 
 def measured(runs: Sequence[Path]) -> Costs:
     """Costs of units from reports of finished reconstructions, the others here."""
-    image_s, pair_s, matches, verified = [], [], 0, 0
+    image_s, pair_s, matches, verified, sizes = [], [], 0, 0, []
     for run in runs:
+        root = Path(json.loads((run / "run.json").read_text())["image_root"])
         stages = json.loads((run / "report.json").read_text())["stages"]
         image_s += [row["cpu_s"] for row in stages["features"]["images"] if row.get("cpu_s")]
+        sizes += [(root / row["name"]).stat().st_size for row in stages["features"]["images"]]
         pair_s += [row["cpu_s"] for row in stages["matching"]["pairs"]]
         matches += stages["matching"]["num_matches"]
         verified += len(stages["matching"]["pairs"])
@@ -175,6 +179,7 @@ def measured(runs: Sequence[Path]) -> Costs:
         return Costs(
             image_s, pair_s, _unit_s(Path(folder)), *_take_s(Path(folder), matches / verified), *_vector_s(),
             pairs_per_image=_pairs_per_image(), matches_per_pair=matches / verified,
+            photo_bytes=float(np.mean(sizes)),
         )  # fmt: skip
 
 
@@ -248,10 +253,11 @@ def markdown(report: dict[str, Any]) -> str:
     """The tables."""
     costs = report["costs"]
     unit_ms, image_ms, pairs_ms = (1000 * costs[name] for name in ("unit_s", "take_image_s", "take_pairs_s"))
+    pair_ms, photo_mb = 1000 * np.mean(costs["pair_s"]), costs["photo_bytes"] / 1e6
     lines = [
-        f"Measured {report['date'][:10]}, {report['commit']}, {report['cpu']}: a photograph"
-        f" {np.mean(costs['image_s']):.2f} CPU s, a pair {1000 * np.mean(costs['pair_s']):.0f} ms; of the client"
-        f" {unit_ms:.1f} ms for a unit, {image_ms:.1f} ms for features of an image, {pairs_ms:.1f} ms for 64 pairs.",
+        f"Measured {report['date'][:10]}, {report['commit']}, {report['cpu']}: a photograph of {photo_mb:.1f} MB"
+        f" {np.mean(costs['image_s']):.2f} CPU s, a pair {pair_ms:.0f} ms; of the client {unit_ms:.1f} ms for a unit,"
+        f" {image_ms:.1f} ms for features of an image, {pairs_ms:.1f} ms for 64 pairs.",
         "",
         "| photographs | workers | features, h | busiest | pairs, h | matching, h | busiest | done again"
         " | read, written, sent, GB | memory of the client, GB |",
