@@ -163,6 +163,18 @@ def test_an_attempt_that_came_to_nothing_leaves_no_cameras(
     assert replay.pose_model.tolist() == [0] * 4
 
 
+def test_points_of_a_step_with_other_tracks_are_grey(job: tuple[ImageSet, list[Features], Reconstruction]) -> None:
+    image_set, features, model = job
+    steps = replayed(model).steps
+    ids = steps[1].point_track_idx
+    assert ids is not None
+    others = replace(steps[1], point_track_idx=ids + len(model.point_rgb))  # of a round of mapping that was given up
+    replay = make_replay(image_set, features, [model], [steps[0], others, *steps[2:]])
+    rgb = replay.cloud_rgb[replay.cloud_ptr[1] : replay.cloud_ptr[2]]
+    assert len(rgb) == len(ids)
+    assert (rgb == 128).all()
+
+
 def test_replay_survives_the_way_to_the_other_process(
     job: tuple[ImageSet, list[Features], Reconstruction], tmp_path: Path
 ) -> None:

@@ -228,7 +228,13 @@ def _history(
 
 
 def _colors(reconstruction: Reconstruction, step: Step) -> NDArray[np.uint8]:
-    """(K, 3) colours of the points of a step; points that did not last have none and are grey."""
+    """(K, 3) colours of the points of a step; points that did not last have none and are grey.
+
+    So are those of a step whose tracks are not those of the model, as a round of mapping that was given up made others.
+    """
+    assert step.point_track_idx is not None
+    if len(step.point_track_idx) and step.point_track_idx.max() >= len(reconstruction.point_rgb):
+        return np.full((len(step.point_track_idx), 3), 128, np.uint8)
     rgb = reconstruction.point_rgb[step.point_track_idx]
     return np.where(rgb.any(1, keepdims=True), rgb, np.uint8(128))
 
