@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rendered_worlds import textures
 from rendered_worlds.motion import CAM_FROM_BODY
 from rendered_worlds.rendering import Optics, Renderer, World
-from rendered_worlds.worlds import STREETS, UP, Skin, WorldBuilder, _Street
+from rendered_worlds.worlds import STREETS, UP, Skin, WorldBuilder, _Street, road_under_the_sky
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.names import CameraModel
 from sfmapp.geometry import rigid3
@@ -65,10 +65,7 @@ def town_world(seed: int = 0) -> World:
     """Blocks between and around the streets."""
     rng = np.random.default_rng([seed, 0x70E4])
     build = WorldBuilder(rng)
-    stains = build.texture(textures.dirt(rng))
-    road = Skin(build.texture(textures.asphalt(rng)), 6.0, stains, 17.3)
-    sky = build.texture(textures.clouds(rng))
-    build.inside((700.0, 700.0), 400.0, Skin(sky, 900.0, glows=True), road, Skin(sky, 900.0, glows=True))
+    stains = road_under_the_sky(build)
     town = _Town(build, stains)
     for i in range(NUM_CROSSINGS + 1):
         for j in range(NUM_CROSSINGS + 1):

@@ -396,15 +396,21 @@ class Streets:
 STREETS = Streets()
 
 
+def road_under_the_sky(build: WorldBuilder) -> int:
+    """Asphalt as far as one sees, and clouds over it; the texture of its stains."""
+    stains = build.texture(textures.dirt(build.rng))
+    road = Skin(build.texture(textures.asphalt(build.rng)), 6.0, stains, 17.3)
+    sky = Skin(build.texture(textures.clouds(build.rng)), 900.0, glows=True)
+    build.inside((700.0, 700.0), 400.0, sky, road, sky)
+    return stains
+
+
 @lru_cache(maxsize=2)
 def street_world(seed: int = 0, *, moving_cars: int = 0) -> World:
     """Four streets round a block, with houses, hedges, kerbs, parked cars, trees, poles; moving cars on request."""
     rng = np.random.default_rng([seed, 0x57E7])
     build = WorldBuilder(rng)
-    stains = build.texture(textures.dirt(rng))
-    road = Skin(build.texture(textures.asphalt(rng)), 6.0, stains, 17.3)
-    sky = build.texture(textures.clouds(rng))
-    build.inside((700.0, 700.0), 400.0, Skin(sky, 900.0, glows=True), road, Skin(sky, 900.0, glows=True))
+    stains = road_under_the_sky(build)
     paint = Skin(build.texture(textures._finish(215 + 12 * textures.noise(rng, 128, 16, 4))), 1.0, stains, 2.9)
     x_ends = (STREETS.xs[0] - STREETS.beyond, STREETS.xs[1] + STREETS.beyond)
     y_ends = (STREETS.ys[0] - STREETS.beyond, STREETS.ys[1] + STREETS.beyond)

@@ -126,7 +126,7 @@ class DaskExecutor:
                     job.cancel()
                 while waiting and len(jobs) < _AHEAD * sum(self._fit.values()):
                     n, workers = waiting.popleft(), frozenset(self._fit)
-                    job = self._client.submit(do_unit, work, units[n], workers=sorted(workers), key=_key(), pure=False)
+                    job = self._client.submit(do_unit, work, units[n], workers=sorted(workers), pure=False)
                     jobs[job] = n, workers
                     job.add_done_callback(answers.put)
                 job = _next(answers)
@@ -181,10 +181,6 @@ class DaskExecutor:
         if not fit and not self._is_waiting:
             self._events.warned(STAGE, "there is no worker to give work to: waiting for one")
         self._is_waiting = not fit
-
-
-def _key() -> str:
-    return f"sfmapp-{secrets.token_hex(12)}"
 
 
 def _next(answers: queue.SimpleQueue[Any]) -> Any:

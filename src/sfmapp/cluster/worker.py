@@ -36,22 +36,18 @@ class Facts:
         code: hash of sfmapp's source.
         versions: of Python and of the libraries that compute, by name.
         seen: of the paths that it was asked for.
-        host, processor: for people.
+        host: for people.
     """
 
     code: str
     versions: Mapping[str, str]
     seen: tuple[str, ...]
     host: str
-    processor: str
 
 
 def facts(paths: tuple[str, ...]) -> Facts:
     """What this process is, and which of some paths it sees."""
-    return Facts(
-        _code(), _versions(), tuple(path for path in paths if os.path.exists(path)), platform.node(),
-        platform.processor() or platform.machine(),
-    )  # fmt: skip
+    return Facts(_code(), _versions(), tuple(path for path in paths if os.path.exists(path)), platform.node())
 
 
 def why_unfit(own: Facts, other: Facts, paths: tuple[str, ...]) -> str:
