@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rendered_worlds import sequences as rendered
 from rendered_worlds.rendering import Optics, World
 from rendered_worlds.sequences import RenderedSequence
-from sfmapp.adjust.covariance import similarity_basis
+from sfmapp.adjust.gauge import similarity_basis
 from sfmapp.camera.camera import Camera, CameraModel
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity

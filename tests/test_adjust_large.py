@@ -17,7 +17,7 @@ from sfmapp.camera.camera import project
 from sfmapp.camera.names import CameraModel
 from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
-from sfmapp.geometry import rigid3
+from sfmapp.geometry import rigid3, similarity
 from sfmapp.scene.synthetic import make_scene, perturb, synthetic_camera, synthetic_rig
 
 OPTIONS = AdjustOptions(loss="cauchy", loss_scale_px=1.0)
@@ -148,7 +148,15 @@ def test_threads_and_batches_change_nothing(monkeypatch):
     monkeypatch.undo()
     small = start_of(scene)
     adjust_bundle(small, OPTIONS)
-    np.testing.assert_allclose(states[0].cam_from_world, small.cam_from_world, atol=1e-7)
+    assert_same_shape(states[0], small)
+
+
+def assert_same_shape(model, expected):
+    """The same but for a similarity of the whole, which no observation tells."""
+    found = similarity.align_poses(model.cam_from_world, expected.cam_from_world).b_from_a
+    moved = similarity.transform_poses(found, model.cam_from_world)
+    np.testing.assert_allclose(moved, expected.cam_from_world, atol=1e-7)
+    assert model.cameras[0].params == pytest.approx(expected.cameras[0].params, rel=1e-6)
 
 
 def test_large_systems_are_left_to_the_envelope():
@@ -221,6 +229,32 @@ def test_rounds_come_to_the_minimum_that_exact_steps_come_to(monkeypatch):
     assert report.num_iterations <= expected.num_iterations + 5
     assert (found[0].cam_from_world == found[1].cam_from_world).all()
     assert found[0].cameras[0].focal == pytest.approx(exact.cameras[0].focal, rel=1e-6)
+
+
+@pytest.mark.parametrize("held", ["nothing", "two images"])
+def test_a_factor_that_is_held_leads_to_the_minimum_of_exact_steps_in_the_same_gauge(monkeypatch, held):
+    """From a start where the first factor is far off the last, with the whole free and with two images that hold it."""
+    monkeypatch.setattr(solver, "choose_solver", lambda *_, **__: "envelope")
+    monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+    scene = make_scene(3, 40, 500)
+    varying = Varying(images=np.arange(40) > 1) if held == "two images" else Varying()
+    tight = AdjustOptions(loss="cauchy", loss_scale_px=1.0, relative_cost_tolerance=1e-10)
+    models, made, factored = [start_of(scene) for _ in range(2)], [], []
+    factor = EnvelopeSystem.factor
+    monkeypatch.setattr(EnvelopeSystem, "factor", lambda self, *a: factored.append(1) or factor(self, *a))
+    for model, may_iterate in zip(models, (False, True), strict=True):
+        factored.clear()
+        engine = make_engine(model, tight, varying, may_iterate=may_iterate)
+        report = solver.run_engine(engine, model, tight, threads=1, events=None)
+        made.append((report.num_iterations, len(factored), report.final_cost))
+    (exact_steps, exact_factors, exact_cost), (steps, factors, cost) = made
+    assert cost == pytest.approx(exact_cost, rel=1e-9)
+    assert exact_factors == exact_steps
+    assert factors <= steps / 2
+    assert steps <= exact_steps + 3
+    assert_same_shape(models[1], models[0])
+    sizes = [np.linalg.norm(rigid3.center(m.cam_from_world[5]) - rigid3.center(m.cam_from_world[4])) for m in models]
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-6 if held == "two images" else 2e-3)
 
 
 def test_rounds_are_for_what_is_large_and_full():

@@ -22,8 +22,8 @@ from inertial_flights import (
     true_map,
 )
 from odometry_sequences import gauge_errors
-from sfmapp.adjust.covariance import similarity_basis
 from sfmapp.adjust.factors import gtsam_pose
+from sfmapp.adjust.gauge import similarity_basis
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
 from sfmapp.odometry.inertial import graph as inertial_graph

@@ -20,6 +20,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.gauge import moves_into_gauge, similarity_basis
 from sfmapp.adjust.kernels import (
     CANON,
     POINT,
@@ -224,35 +225,6 @@ def _through_others(tiles: tuple[Ints, Ints, Array], is_kept: Mask) -> Array:
     with threadpool_limits(1, "blas"):  # of many small products
         found[:, met] = scaled.T @ factor.solve(scaled[:, met].toarray())
     return found
-
-
-def similarity_basis(poses: Array) -> tuple[Array, Array]:
-    """What infinitesimal similarities of the world do to poses (I, 7), and the constraint of the nearest one.
-
-    Returns basis (7, I * 6), rows for turns, shifts and scale about the mean centre, all of the size of the scene, and
-    constraint (7, I * 6), whose product with the errors vanishes in the gauge of this module.
-    """
-    rotation, centers = rigid3.rotation_matrix(poses), rigid3.center(poses)
-    mean = centers.mean(0)
-    size = max(float(np.sqrt(((centers - mean) ** 2).sum(1).mean())), 1e-12)
-    t = np.einsum("nij,j->ni", rotation, mean) + poses[:, 4:]
-    basis = np.zeros((7, len(poses), 6))
-    basis[:3, :, :3] = -rotation.transpose(2, 0, 1)
-    basis[:3, :, 3:] = -(rigid3.skew(t) @ rotation).transpose(2, 0, 1)
-    basis[3:6, :, 3:] = -size * rotation.transpose(2, 0, 1)
-    basis[6, :, 3:] = t
-    weight = np.repeat([size * size, 1.0], 3)
-    return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
-
-
-def moves_into_gauge(basis: Array, constraint: Array) -> Array:
-    """(k, N) how much of each freedom takes errors (N,) into the gauge of a constraint: they are there without
-    ``basis.T @ (moves @ errors)``, as in inner constraints (Triggs et al., "Bundle Adjustment", 1999, section 9).
-
-    Args:
-        basis: (k, N) what the freedoms do. constraint: (k, N) rows whose products with errors vanish in the gauge.
-    """
-    return np.asarray(np.linalg.solve(constraint @ basis.T, constraint), np.float64)
 
 
 def gauge_of(

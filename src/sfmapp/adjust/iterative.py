@@ -5,6 +5,9 @@ A product with it passes once over the ``Z`` of all points (:func:`sfmapp.adjust
 preconditioner has the tiles of clusters of neighbouring blocks, factored exactly (as in Kushal and Agarwal, CVPR 2012);
 the rest of the reduced system is not there. Steps need not be exact: rounds stop when the quadratic model gains little
 more (Nash and Sofer 1990), and the closer the nearer the minimum is.
+
+Systems that can be factored are, once: from step to step they change by little, and the factor of an earlier one is so
+good a preconditioner that a few rounds cost less than making and factoring the next.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.elimination import COLUMNS
 from sfmapp.adjust.envelope import EnvelopeSystem
+from sfmapp.adjust.gauge import StepsInGauge
 from sfmapp.adjust.kernels import ImageArrays, LensArrays, Meetings
 from sfmapp.simd.pointers import pointer
 
@@ -37,31 +41,59 @@ def is_of_cluster(first: Ints, second: Ints) -> NDArray[np.bool_]:
 
 
 class IterativeSystem:
-    """Conjugate gradients with a clustered preconditioner; keys and numbers as of ``EnvelopeSystem``, of pairs of one
-    cluster."""
+    """Conjugate gradients, preconditioned by the factor of a system that is near: of clusters of blocks, or of all as
+    it was some steps before.
 
-    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints) -> None:
-        self._clusters = EnvelopeSystem(block_dim, keys, numbers)
+    Attributes:
+        is_held: the factor is that of an earlier step, and near enough: tiles need not be made. The caller sets it to
+            False where he knows better.
+        num_rounds: that the last step took.
+    """
+
+    def __init__(self, block_dim: Ints, near: EnvelopeSystem, held_rounds: int = 0) -> None:
+        """near: of clusters, to be factored in each step. held_rounds: or of the whole, whose factor is held for as
+        long as a step takes no more rounds."""
+        self._near, self._held_rounds = near, held_rounds
+        self._max_rounds = 2 * held_rounds if held_rounds else _MAX_ROUNDS
         self._used = (np.arange(8) < block_dim[:, None]).ravel()
         self._last_gradient = np.inf
-        self.num_rounds = 0
+        self.is_held, self.num_rounds = False, 0
 
     def solve_with(
-        self, product: Callable[[Array], Array], tiles: Array, rhs: Array, run: Callable[..., Any]
-    ) -> Array | None:
+        self, product: Callable[[Array], Array], gauge: Callable[[], StepsInGauge], tiles: Array, rhs: Array,
+        run: Callable[..., Any],
+    ) -> Array | None:  # fmt: skip
         """Solution (B * 8,), None where the system is not positive definite.
 
         Args:
-            product: of the damped reduced system with a vector (B * 8,). tiles: of the damped clusters. rhs: (B * 8,).
+            product: of the damped reduced system with a vector (B * 8,). gauge: of the present state; a factor that is
+                held has that of an earlier one. tiles: of what is near, damped; not looked at while its factor is held.
+            rhs: (B * 8,).
         """
-        if not self._clusters.factor(tiles, run):
-            return None
+        if not self.is_held:
+            if not self._near.factor(tiles, run):
+                return None
+            if self._held_rounds:
+                self.is_held, self.num_rounds = True, 0
+                return self._near.substitute(rhs)
+        steps = gauge() if self._held_rounds else None
+
+        def near(rest: Array) -> Array:
+            if steps is None:
+                return self._near.substitute(rest)
+            return steps.of(self._near.substitute(steps.of_gradient(rest)))
+
+        found = self._rounds(product, near, rhs)
+        self.is_held = self.num_rounds <= self._held_rounds
+        return found
+
+    def _rounds(self, product: Callable[[Array], Array], near: Callable[[Array], Array], rhs: Array) -> Array | None:
         x, rest = np.zeros(len(rhs)), np.where(self._used, rhs, 0.0)
-        better = self._clusters.substitute(rest)
+        better = near(rest)
         direction, gain, gained = better, float(rest @ better), 0.0
         wanted = self._forcing(np.sqrt(max(gain, 0.0)))
         self.num_rounds = 0
-        for n in range(1, _MAX_ROUNDS + 1):
+        for n in range(1, self._max_rounds + 1):
             image = product(direction)
             curvature = float(direction @ image)
             if not curvature > 0.0:
@@ -73,7 +105,7 @@ class IterativeSystem:
             gained += more
             if n * more <= wanted * gained:
                 break
-            better = self._clusters.substitute(rest)
+            better = near(rest)
             before, gain = gain, float(rest @ better)
             direction = better + gain / before * direction
         return x

@@ -58,12 +58,18 @@ def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing
 
 
 def prefers_rounds(num_entries: int, num_products: int, flops: float) -> bool:
-    """Whether conjugate gradients are clearly quicker than making the reduced system and factoring it.
+    """Whether conjugate gradients are clearly quicker than making the reduced system and factoring it; arguments as of
+    :func:`rounds_worth`."""
+    return rounds_worth(num_entries, num_products, flops) > _CLEARLY * _ROUNDS
+
+
+def rounds_worth(num_entries: int, num_products: int, flops: float) -> float:
+    """How many rounds of conjugate gradients take as long as making the reduced system and factoring it.
 
     Args:
         num_entries: blocks that meet a point, over all points. num_products: pairs of them. flops: of the factor.
     """
-    return _PRODUCT_S * num_products + _FLOP_S * flops > _CLEARLY * _ROUNDS * _ENTRY_S * num_entries
+    return (_PRODUCT_S * num_products + _FLOP_S * flops) / (_ENTRY_S * max(1, num_entries))
 
 
 def group_blocks(near: NDArray[np.bool_], num_poses: int) -> list[Ints]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from sfmapp.adjust.elimination import (
     mark_pairs,
     subtract_products,
 )
+from sfmapp.adjust.gauge import StepsInGauge
 from sfmapp.adjust.kernels import Meetings, RobustLoss, Scratch, State, Sums
 from sfmapp.adjust.linear import (
     LapackSystem,
@@ -38,6 +40,7 @@ from sfmapp.adjust.linear import (
     may_suit_gtsam,
     one_blas_thread,
     prefers_rounds,
+    rounds_worth,
 )
 from sfmapp.adjust.options import REJECTED_WEIGHT, AdjustOptions, AdjustReport, FactorReport
 from sfmapp.adjust.priors import IntrinsicPriors
@@ -61,6 +64,8 @@ _POINTS_SETTLED = 1e-3
 _CHUNK_OBSERVATIONS, _MAX_CHUNKS = 16384, 8
 # Entries of a batch of points, of 192 bytes each, and products of blocks worth a thread.
 _BATCH_ENTRIES, _PART_PRODUCTS, _MAX_PARTS = 700_000, 1_000_000, 64
+# Up to so many entries, 400 MB, all points are one batch where that lets a factor be held.
+_HELD_ENTRIES = 2_000_000
 
 
 def import_ahead(num_images: int, *, with_factors: bool) -> None:
@@ -235,15 +240,14 @@ class Engine:
             self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
         if self.solver == "envelope":
             from sfmapp.adjust.envelope import EnvelopeOrder, EnvelopeSystem  # loads scipy
+            from sfmapp.adjust.iterative import IterativeSystem, is_of_cluster
 
             order = EnvelopeOrder(p.block_dim, *np.divmod(keys, blocks))
-            num_entries, num_products = len(self.meetings.block), int(products.sum())
-            if may_iterate and self.extras is None and prefers_rounds(num_entries, num_products, order.flops):
-                from sfmapp.adjust.iterative import IterativeSystem, is_of_cluster
-
-                self.solver = "iterative"
+            cost = len(self.meetings.block), int(products.sum()), order.flops
+            may_iterate = may_iterate and self.extras is None
+            if may_iterate and prefers_rounds(*cost):
+                self.solver, order = "iterative", None
                 keys = keys[is_of_cluster(*np.divmod(keys, blocks))]
-                self.iterative = IterativeSystem(p.block_dim, keys, np.arange(len(keys)))
         self.has_all_tiles = is_small or self.solver == "tiles"
         self.tile_keys = np.arange(blocks * blocks) if self.has_all_tiles else keys
         numbers = keys if self.has_all_tiles else np.arange(len(keys))
@@ -255,8 +259,12 @@ class Engine:
             self.system = SparseSystem(p, keys, numbers, self.extras.block_keys() if self.extras else [])
         elif self.solver == "lapack":
             self.system = LapackSystem(p.block_dim, keys, numbers)
-        elif self.solver == "envelope":
-            self.system = EnvelopeSystem(p.block_dim, keys, numbers, order)
+        elif self.solver in ("envelope", "iterative"):
+            self.system = near = EnvelopeSystem(p.block_dim, keys, numbers, order)
+            if self.solver == "iterative":
+                self.iterative = IterativeSystem(p.block_dim, near)
+            elif may_iterate and cost[0] <= _HELD_ENTRIES:
+                self.iterative = IterativeSystem(p.block_dim, near, int(rounds_worth(*cost) / 2))
         return products
 
     def _met_pairs(self) -> Ints:
@@ -302,8 +310,16 @@ class Engine:
         return one_blas_thread() if self.solver in ("lapack", "envelope", "iterative") else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
-        """Reduced system at the current state with damped points; returns the cost of the state."""
-        p, self.damping = self.problem, damping
+        """Reduced system at the current state with damped points; returns the cost of the state.
+
+        The tiles are left as they are while the factor of an earlier step is held.
+        """
+        p = self.problem
+        # more damping than the factor that is held has: the steps to come are others
+        is_held = self.iterative is not None and self.iterative.is_held and damping <= self.damping
+        if self.iterative is not None:
+            self.iterative.is_held = is_held
+        self.damping = damping
         points, images, lenses = p.points, p.images(self.rows), p.lenses
         self.own[:], self.cross[:], self.gradient[:] = 0.0, 0.0, 0.0
         cost = 0.0
@@ -326,7 +342,8 @@ class Engine:
                 )  # fmt: skip
 
             cost += sum(run(chunk, range(self.num_chunks)))
-            list(run(products, range(len(self.parts) - 1)))
+            if not is_held:
+                list(run(products, range(len(self.parts) - 1)))
         own, gradient = np.zeros(p.num_blocks * 64), np.zeros(p.num_blocks * 8)
         self.priors.add(p.canonical, own, gradient)
         if self.extras is not None:
@@ -359,7 +376,8 @@ class Engine:
         used = np.arange(8) < p.block_dim[:, None]
         tiles[place[used]] += self.damping * self.diagonal.reshape(-1, 8)[used]
         if self.iterative is not None:
-            found = self.iterative.solve_with(lambda x: self._product(x, run), tiles, right, run)
+            gauge = partial(StepsInGauge, p, self.num_freedoms, self.diagonal)
+            found = self.iterative.solve_with(lambda x: self._product(x, run), gauge, tiles, right, run)
         else:
             if self.system is None:
                 self.system = TileSystem(blocks)
@@ -404,12 +422,17 @@ class Engine:
         """Numbers observed beyond those that are unknown, extra factors and their own unknowns left out."""
         p = self.problem
         num_unknowns = int(p.block_dim.sum())
-        is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and self.extras is None
-        free_gauge = 0 if not is_free else 6 if p.has_baseline else 7
         num_eliminated = int((~p.is_constant & (p.point_block < 0)).sum())
         if self.extras is not None:
             num_unknowns -= self.extras.num_own_dims
-        return 2 * p.num_observations - 3 * num_eliminated - num_unknowns + free_gauge
+        return 2 * p.num_observations - 3 * num_eliminated - num_unknowns + self.num_freedoms
+
+    @property
+    def num_freedoms(self) -> int:
+        """Of a similarity that changes nothing: seven, six with a baseline, none where something is held."""
+        p = self.problem
+        is_free = (p.pose_block >= 0).all() and not p.is_constant.any() and self.extras is None
+        return 0 if not is_free else 6 if p.has_baseline else 7
 
     def tile_numbers(self, keys: Ints) -> Ints:
         """Tiles of block pairs a B + b."""

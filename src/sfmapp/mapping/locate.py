@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import moved_to_gauge, moves_into_gauge, similarity_basis
+from sfmapp.adjust.covariance import moved_to_gauge
+from sfmapp.adjust.gauge import moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.pose import refine_pose

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -359,10 +360,12 @@ class Mapper:
         limit decide what many others tell little of, such as the lens.
         """
         self.loss_scale_px = self._residual_scale_px
-        return adjust_until_settled(self._polish_once, STAGE, self.events)
+        let_go = np.zeros(self.reconstruction.tracks.num_tracks, bool)
+        return adjust_until_settled(partial(self._polish_once, let_go), STAGE, self.events)
 
-    def _polish_once(self, num_steps: int) -> Round:
-        """Some steps of closing adjustment, after which observations are chosen anew."""
+    def _polish_once(self, let_go: NDArray[np.bool_], num_steps: int) -> Round:
+        """Some steps of closing adjustment, after which observations are chosen anew; ``let_go`` (T,) bool are points
+        that earlier rounds have lost, to which this one adds."""
         reconstruction = self.reconstruction
         before = reconstruction.obs_is_inlier.copy()
         options, chosen = self._polishing()
@@ -372,7 +375,7 @@ class Mapper:
         )  # fmt: skip
         report = graph.optimize(self.events)
         self.events.decided(STAGE, f"closing adjustment: {report.text}", **report)
-        self._settle_points()
+        self._settle_points(let_go)
         made = Round(report, before, reconstruction.obs_is_inlier.copy())
         summary = reconstruction.summary()
         self.events.decided(
@@ -549,15 +552,26 @@ class Mapper:
             options = replace(options, refine_principal_point=True, principal_point_sigma_px=sigma_px)
         return options, self._everything(centers=chosen)
 
-    def _settle_points(self) -> None:
-        """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible."""
+    def _settle_points(self, let_go: NDArray[np.bool_] | None = None) -> None:
+        """Measure the noise; filter accordingly, and triangulate again what was lost or has become possible, without
+        points that are ``let_go`` (T,) bool: those that are lost now are added to it.
+
+        A point of two rays that miss each other by several deviations is triangulated in their middle, from where a
+        robust loss slides, in a good ten steps, to one of them and lets go of the other: triangulated again, it would
+        do so in every round.
+        """
         scale = structure.residual_scale_px(self.reconstruction)
         # one pixel is about what the best detectors reach on blurred or distorted images: never filter below it
         lower, upper = min(1.0, self.options.max_reprojection_error_px), self.options.max_reprojection_error_px
         if np.isfinite(scale):
             self.max_error_px = float(np.clip(self.options.max_reprojection_error_sigmas * scale, lower, upper))
+        before = self.reconstruction.is_triangulated
         structure.filter_observations(self.reconstruction, self.options, self.pool, None, self.max_error_px)
-        missing = np.flatnonzero(~self.reconstruction.is_triangulated)
+        is_missing = ~self.reconstruction.is_triangulated
+        if let_go is not None:
+            let_go |= is_missing & before
+            is_missing &= ~let_go
+        missing = np.flatnonzero(is_missing)
         structure.triangulate(self.reconstruction, missing, self.options, self.pool, self.max_error_px)
         self._drop_weak_images()
 

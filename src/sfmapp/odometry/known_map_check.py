@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import pose_errors_in_gauge, similarity_basis
+from sfmapp.adjust.covariance import pose_errors_in_gauge
+from sfmapp.adjust.gauge import similarity_basis
 from sfmapp.camera.camera import Camera, project_jacobian
 from sfmapp.contradictions import Contradiction, widened_scale_sigma
 from sfmapp.geometry import rigid3, similarity

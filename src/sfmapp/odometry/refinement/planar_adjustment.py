@@ -19,7 +19,7 @@ import numpy as np
 from gtsam.symbol_shorthand import G, X
 from numpy.typing import NDArray
 
-from sfmapp.adjust.covariance import moves_into_gauge, similarity_basis
+from sfmapp.adjust.gauge import moves_into_gauge, similarity_basis
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.adjust.options import AdjustOptions, AdjustReport
 from sfmapp.adjust.problem import Varying
