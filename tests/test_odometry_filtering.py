@@ -144,7 +144,7 @@ def test_gaps_are_bridged_within_three_sigma(gap_s: float) -> None:
     assert low < np.mean(ends) / 6 < high
 
 
-def test_wrong_poses_are_left_out_and_jumps_followed() -> None:
+def test_wrong_poses_are_left_out_and_jumps_are_the_maps() -> None:
     case, wrong = CASES[1], np.array([40, 41, 90, 150, 200])
     rng = np.random.default_rng(8)
     poses = case.poses.copy()
@@ -160,9 +160,15 @@ def test_wrong_poses_are_left_out_and_jumps_followed() -> None:
     jumped[150:] = rigid3.compose(jumped[150:], moved)
     f = filter_trajectory(case.times, jumped, case.covariance, case.sensor)
     assert f.is_rejected.nonzero()[0].tolist() == [150, 151, 152]
-    after = f.frame_row[165:]
-    error = tangent(f.cam_from_world[after], rigid3.compose(case.truth[165:], moved))
-    assert np.abs(error[:, 3:]).max() < 0.06
+    # no camera goes 10 m between two frames without its sensor feeling it: from there poses are believed, and the
+    # camera stays where it is in the world
+    rows = f.frame_row[150:]
+    error = tangent(f.cam_from_world[rows], case.truth[150:])
+    sigma = np.sqrt(np.diagonal(f.covariance[rows], axis1=1, axis2=2))
+    assert np.abs(error[:, 3:]).max() < 0.03
+    assert (np.abs(error) < 4.0 * sigma).all()
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(f.nis[160:]))
+    assert low < f.nis[160:].sum() < high
 
 
 def test_silence_of_the_sensor_and_long_gaps_begin_anew() -> None:

@@ -215,11 +215,7 @@ class FilterState:
         noise = in_map @ noise @ in_map.T
         walked = shared.walk * noise + _STEPS * (1.0 - shared.white) * self._grown(noise, shared.renewed)
         here, turning = self._center(), rigid3.exp_so3(self._rate[3:])
-        spread = np.zeros((_SIZE, 6))
-        spread[_P, :3] = spread[_CP, :3] = np.eye(3)
-        spread[_P, 3:], spread[_CP, 3:] = -rigid3.skew(self._position - here), -rigid3.skew(self._shift - here)
-        spread[_R, 3:], spread[_CR, 3:] = self._rotation.T, np.eye(3)
-        spread[_V, 3:], spread[_G, 3:] = -rigid3.skew(self._velocity), -rigid3.skew(self._gravity)
+        spread = self._moved_with_map()
         step, kept = np.eye(_SIZE), max(0.0, 1.0 - 0.5 * shared.walk)
         step[:, _U] = spread
         step[_U, _U] = kept * np.eye(6)
@@ -231,6 +227,15 @@ class FilterState:
         self._velocity, self._gravity = turning @ self._velocity, turning @ self._gravity
         self._rate = kept * self._rate
         self._change_unit(shared, noise, center)
+
+    def _moved_with_map(self) -> Array:
+        """(31, 6) slopes of the state by the map: how far it moves where the camera is, and how it turns about that."""
+        here, spread = self._center(), np.zeros((_SIZE, 6))
+        spread[_P, :3] = spread[_CP, :3] = np.eye(3)
+        spread[_P, 3:], spread[_CP, 3:] = -rigid3.skew(self._position - here), -rigid3.skew(self._shift - here)
+        spread[_R, 3:], spread[_CR, 3:] = self._rotation.T, np.eye(3)
+        spread[_V, 3:], spread[_G, 3:] = -rigid3.skew(self._velocity), -rigid3.skew(self._gravity)
+        return spread
 
     def _grown(self, noise: Array, renewed: float) -> Array:
         """By how much a covariance (6, 6), in the axes of the map, is larger than that of the last pose with a share of
@@ -345,10 +350,11 @@ class FilterState:
         self._log_scale, self._rate = self._log_scale + float(step[24]), self._rate + step[_U]
 
     def forget(self, innovation: Array) -> None:
-        """The motion jumped: what was predicted says little about where and how fast."""
-        squares = [(innovation[:3] ** 2).sum(), (innovation[3:] ** 2).sum(), self._speed**2]
-        moving = _ROWS[: _BG.start]
-        self._p[moving, moving] += np.repeat(squares, 3)
+        """The poses jumped, and go on from there: the map did. What carries a camera moves steadily between the samples
+        of its sensor, and the world stays where that expects it."""
+        squares = [(innovation[:3] ** 2).sum(), (innovation[3:] ** 2).sum()]
+        spread = self._moved_with_map()
+        self._p += (spread * np.repeat(squares, 3)) @ spread.T
 
     def doubt(self) -> None:
         """What is believed of the sensor, of gravity and of the unit of length is no surer than before the first pose.

@@ -126,8 +126,9 @@ def filter_trajectory(
 ) -> FilteredTrajectory:
     """Filter measured poses of frames, using at each time what came before it.
 
-    Poses that the motion contradicts (``options.max_nis``) are left out, up to ``options.max_rejected`` in a row. After
-    a gap that is too long, or that the sensor was silent in, the filter begins anew with the biases that it has.
+    Poses that the motion contradicts (``options.max_nis``) are left out, up to ``options.max_rejected`` in a row: then
+    the map has jumped, and the world, in which the sensor tells how the camera moves, stays where it was. After a gap
+    that is too long, or that the sensor was silent in, the filter begins anew with the biases that it has.
     Without a sensor the level of the accelerations is that of the whole trajectory.
 
     Args:
@@ -430,7 +431,7 @@ class InertialFilter:
                 self._is_rejected[-1] = True
                 return False
             if self._since_forgotten < _WINDOW:
-                # the motion jumped, and again: it is what the sensor is taken for that is wrong
+                # the map jumped, and again: it is what the sensor is taken for that is wrong
                 state.doubt()
                 self._start, self._anchor, self._since_forgotten = state, None, _WINDOW
                 return False
