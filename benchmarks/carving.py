@@ -32,8 +32,9 @@ from sfmapp.carve.box import find_box, tightened
 from sfmapp.carve.hull import Hull, hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.octree import Octree, codes_of
-from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
-from sfmapp.carve.space_carving import CarveOptions, carve, carve_hull
+from sfmapp.carve.options import CarveOptions, MaskOptions
+from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
+from sfmapp.carve.space_carving import carve, carve_hull
 from sfmapp.carve.views import View, project_points
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageSet

@@ -33,10 +33,11 @@ from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, join
 from sfmapp.carve.limits import OUTLINES, PATCHES, find_known
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.sight import sights_of_patches
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, carve_hull
+from sfmapp.carve.space_carving import carve_hull
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.dense.densify import densify
 from sfmapp.dense.options import DenseOptions

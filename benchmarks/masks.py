@@ -24,7 +24,8 @@ from cases import measure_cases
 from rendered_worlds.lit_solids import around, drawn
 from rendered_worlds.solids import photograph
 from rendered_worlds.turntables import seen_in
-from sfmapp.carve.silhouettes import MaskOptions, find_silhouettes
+from sfmapp.carve.options import MaskOptions
+from sfmapp.carve.silhouettes import find_silhouettes
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageOptions
 from sfmapp.images.load import load_images

@@ -21,7 +21,8 @@ from cases import measure_cases
 from masks import by_rectangle, scores
 from rendered_worlds.lit_solids import drawn, house, jug
 from rendered_worlds.turntables import Conditions, Turntable, turned
-from sfmapp.carve.silhouettes import MaskOptions, find_silhouettes
+from sfmapp.carve.options import MaskOptions
+from sfmapp.carve.silhouettes import find_silhouettes
 from sfmapp.carve.still_cameras import still_groups
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageOptions

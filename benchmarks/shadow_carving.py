@@ -32,11 +32,12 @@ from rendered_worlds.solids import Rendering, Solid, photograph, render
 from sfmapp.carve.cell_grid import CellGrid, grid_of
 from sfmapp.carve.lamp_mixtures import LampLight
 from sfmapp.carve.octree import Octree, places_of
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.shadow_carving import Shadow, ShadowOptions, carve_shadows
 from sfmapp.carve.shadows import LitPhotograph, find_shadows
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.space_carving import carve
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.geometry import rigid3
 

@@ -39,9 +39,10 @@ from sfmapp.carve.coloring import color_surface
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.joined import Evidence, join
+from sfmapp.carve.options import CarveOptions, MaskOptions
 from sfmapp.carve.rendering import show_mesh
-from sfmapp.carve.silhouettes import MaskOptions, find_silhouettes
-from sfmapp.carve.space_carving import CarveOptions, carve_hull
+from sfmapp.carve.silhouettes import find_silhouettes
+from sfmapp.carve.space_carving import carve_hull
 from sfmapp.carve.swept_sights import sights_by_colors
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.carve.voxel_coloring import VoxelOptions, carve_by_color

@@ -10,7 +10,8 @@ from carving_scenes import Solid, around, ball, box, ring, silhouette_of, withou
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.limits import OUTLINES, UNSEEN, Known, LimitsReport, find_known, find_limits
-from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.options import CarveOptions
+from sfmapp.carve.space_carving import carve
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.geometry import rigid3
 from sfmapp.scene.mesh import Mesh

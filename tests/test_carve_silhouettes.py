@@ -14,7 +14,8 @@ from carving_scenes import around, ball, both, box
 from sfmapp.carve.backgrounds import edge_pieces
 from sfmapp.carve.graph_cut import cut_by_mask
 from sfmapp.carve.masks_report import MasksReport
-from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
+from sfmapp.carve.options import MaskOptions
+from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.errors import InputError
 from sfmapp.events import Events
 from sfmapp.images.image_set import ImageOptions

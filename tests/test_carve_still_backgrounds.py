@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sfmapp.carve.masks_report import MasksReport
-from sfmapp.carve.silhouettes import MaskOptions, Silhouette, find_silhouettes
+from sfmapp.carve.options import MaskOptions
+from sfmapp.carve.silhouettes import Silhouette, find_silhouettes
 from sfmapp.carve.still_cameras import still_groups
 from sfmapp.errors import InputError, UsageError
 from sfmapp.events import Events

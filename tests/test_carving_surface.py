@@ -9,7 +9,8 @@ from carving_scenes import Solid, around, ball, both, box, ring, silhouette_of
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.isosurface import surface_of
 from sfmapp.carve.octree import Octree, codes_of
-from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.options import CarveOptions
+from sfmapp.carve.space_carving import carve
 from sfmapp.scene.mesh import Mesh, face_vectors
 
 

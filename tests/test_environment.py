@@ -61,6 +61,44 @@ def is_running(pid: int) -> bool:
 # ------------------------------------------------------------------------------------------------ places for kernels
 
 
+KERNELS = """import numba
+import numpy as np
+
+@numba.njit(cache=True)
+def total(values):
+    return np.sum(np.sort(values)[1:])
+
+@numba.njit(cache=True)
+def twice(values):
+    return 2.0 * total(values)
+"""
+CALL = """import sys
+from sfmapp.kernel_cache import load_numba_sparingly
+load_numba_sparingly()
+import numpy as np, kernels
+for name in sys.argv[1:]:
+    print(getattr(kernels, name)(np.array([3.0, 1.0, 2.0])))
+print("numba.np.arraymath" in sys.modules, "scipy.linalg" in sys.modules)
+"""
+
+
+def test_kernels_of_the_cache_are_loaded_without_what_compiles_others(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    environment = os.environ | {
+        kernel_cache.VARIABLE: str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+    }  # fmt: skip
+
+    def call(*names: str) -> list[str]:
+        done = subprocess.run([sys.executable, "-c", CALL, *names], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    assert call("total") == ["5.0", "True False"]  # compiled, without BLAS
+    assert call("total") == ["5.0", "False False"]
+    assert call("total", "twice") == ["5.0", "10.0", "True False"]  # one from the cache, and one that calls it compiled
+    assert call("twice", "total") == ["10.0", "5.0", "False False"]
+
+
 @pytest.fixture
 def locked_package(tmp_path: Path) -> Iterator[Path]:
     """A copy of the package in which nobody may write."""

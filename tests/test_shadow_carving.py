@@ -22,6 +22,7 @@ from sfmapp.carve.lamp_mixtures import LampLight
 from sfmapp.carve.leaning import lamp_gains, quotients_of
 from sfmapp.carve.mixture_kernels import least_mixture
 from sfmapp.carve.octree import Octree, codes_of
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.outlines import signed_distance
 from sfmapp.carve.shadow_carving import Shadow, ShadowCarvingReport, ShadowOptions, carve_shadows
 from sfmapp.carve.shadows import (
@@ -35,7 +36,7 @@ from sfmapp.carve.shadows import (
     quotient_of_lean,
 )
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.space_carving import carve
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.cli.main import main
 from sfmapp.errors import InputError

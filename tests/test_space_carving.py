@@ -13,8 +13,9 @@ from sfmapp.camera.camera import Camera, project
 from sfmapp.camera.names import CameraModel
 from sfmapp.carve.hull import hull_of
 from sfmapp.carve.octree import Octree, codes_of, places_of
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, carve
+from sfmapp.carve.space_carving import carve
 from sfmapp.carve.views import View, view_of_camera
 from sfmapp.errors import InputError, NoReconstructionError
 

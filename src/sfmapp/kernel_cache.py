@@ -65,6 +65,25 @@ def take_turns(*, strict: bool = False) -> None:
             Files.save = _in_turn(Files.save, LOCK_EX, strict)
 
 
+def load_numba_sparingly() -> None:
+    """Have numba load kernels from its cache in this process without what it compiles others with.
+
+    Before it loads the first one numba loads all that any kernel might be compiled with, and scipy.linalg for those
+    that call BLAS: together as much time and memory as numba itself. What is compiled already needs none of it. Here
+    numba does so before it first compiles, and always without BLAS, which no kernel of ours calls. The process has to
+    be a command's own; a program that imports sfmapp keeps its numba whole.
+    """
+    from numba.core import environment
+    from numba.core.caching import FunctionCache
+    from numba.core.cpu import CPUContext
+
+    with _PATCHING:
+        if "load_overload" not in vars(FunctionCache):
+            FunctionCache.load_overload = _load_compiled
+            environment._rebuild_env = _environment_alone(environment._rebuild_env)
+            CPUContext.load_additional_registries = _without_blas(CPUContext.load_additional_registries)
+
+
 def is_ours_alone(folder: Path) -> bool:
     """Whether nobody but this user and root can change what lies in a folder, nor put another in its place.
 
@@ -88,6 +107,54 @@ def _in_turn(work: Callable[..., Any], how: int, strict: bool) -> Callable[..., 
     def method(files: Any, *args: Any) -> Any:
         with _locked(files._cache_path, how, strict):
             return work(files, *args)
+
+    return method
+
+
+def _load_compiled(cache: Any, signature: Any, target: Any) -> Any:
+    """``load_overload`` of numba's cache; what kernels call for memory has to be there, as the rest would see to."""
+    from numba.core.runtime import rtsys
+
+    rtsys.initialize(target)
+    with cache._guard_against_spurious_io_errors():
+        return cache._load_overload(signature, target)
+
+
+def _environment_alone(rebuild: Callable[..., Any]) -> Callable[..., Any]:
+    """``_rebuild_env`` of numba without the modules of numba that a kernel was compiled from: compiled code looks
+    nothing up in them."""
+
+    @wraps(rebuild)  # its name goes into the cache
+    def method(module: str, constants: list[Any], name: str) -> Any:
+        from numba.core.environment import Environment, lookup_environment
+
+        if module in sys.modules or lookup_environment(name) is not None:
+            return rebuild(module, constants, name)
+        found = Environment({"__name__": module})
+        found.consts[:] = constants
+        found.env_name = name
+        Environment._memo[name] = found
+        return found
+
+    return method
+
+
+def _without_blas(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """``load_additional_registries`` of numba's compiler for a numba that finds no BLAS."""
+
+    @wraps(load)
+    def method(context: Any) -> None:
+        from numba.np import linalg
+
+        def find_none() -> None:
+            raise ImportError
+
+        linalg.ensure_blas, found = find_none, linalg.ensure_blas
+        try:
+            import numba.np.arraymath  # noqa: F401
+        finally:
+            linalg.ensure_blas = found
+        load(context)
 
     return method
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.carve.joined import Joined, Nodes
-from sfmapp.carve.octree import MAX_DEPTH, Octree
+from sfmapp.carve.octree import Octree
+from sfmapp.carve.options import MAX_DEPTH
 from sfmapp.carve.sight import Sight, sight_of_map
 from sfmapp.errors import InputError
 from sfmapp.formats.atomic import replaced_file

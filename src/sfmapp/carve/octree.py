@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Codes = NDArray[np.uint64]
 
-# levels whose codes fit: three bits a level, in 63 bits
-MAX_DEPTH = 21
-
 
 @dataclass(frozen=True)
 class Octree:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +21,18 @@ from sfmapp.carve.backgrounds import edge_pieces, without_specks
 from sfmapp.carve.consistency import compare
 from sfmapp.carve.graph_cut import cut_by_rectangle
 from sfmapp.carve.masks_report import MasksReport, PhotographMask
+from sfmapp.carve.options import MaskOptions
 from sfmapp.carve.outlines import Coverage, Silhouette, coverage_of_mask, refined_coverage, signed_distance
 from sfmapp.carve.smooth_backgrounds import cut_from_smooth
 from sfmapp.carve.views import View, project_points
-from sfmapp.errors import InputError, UsageError, listed
+from sfmapp.errors import InputError, listed
 from sfmapp.images.pixels import read_mask_coverage, read_rgb, read_with_alpha
-from sfmapp.option_checks import check_options
 
 if TYPE_CHECKING:
     from sfmapp.events import Events
     from sfmapp.images.image_set import ImageRecord, ImageSet
 
-__all__ = ["MaskOptions", "Silhouette", "find_silhouettes"]
+__all__ = ["Silhouette", "find_silhouettes"]
 
 STAGE = "masks"
 T = TypeVar("T")
@@ -58,30 +58,6 @@ _AT_EDGES = 0.1
 # from this share of a silhouette on a spill is large, and if so many have large ones masks are wrong where the others
 # do not say so as well
 _LARGE_SPILL, _MANY_SPILL = 0.01, 0.25
-
-
-@dataclass(frozen=True)
-class MaskOptions:
-    """Options of the stage ``masks``.
-
-    Attributes:
-        mask_source: Where the object is told from: alpha, mask files, or the colours of the background; auto takes the
-            first that is there. grabcut, which has to be asked for, cuts it out of each photograph by itself, within
-            what the points of a reconstruction span, or all of the picture but its edges.
-        background: A photograph of the background without the object, from where all photographs were taken; what
-            differs from it is the object. None, and a background that stands still is found in the photographs.
-    """
-
-    mask_source: Literal["auto", "alpha", "mask", "background", "grabcut"] = "auto"
-    background: str | None = None
-
-    def __post_init__(self) -> None:
-        check_options("masks", self, {})
-        if self.background is not None and self.mask_source not in ("auto", "background"):
-            raise UsageError(
-                f"masks: a photograph of the background tells nothing where mask_source is {self.mask_source}",
-                "leave one of both out",
-            )
 
 
 @dataclass(frozen=True)

@@ -10,59 +10,27 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfmapp.carve.carving_kernels import Cells, split
 from sfmapp.carve.hull import Hull, hull_of, outline_error
-from sfmapp.carve.octree import MAX_DEPTH, Codes, Octree, codes_of
+from sfmapp.carve.octree import Codes, Octree, codes_of
+from sfmapp.carve.options import MOST_CELLS, CarveOptions
 from sfmapp.carve.silhouettes import Silhouette
 from sfmapp.carve.views import View
 from sfmapp.errors import InputError, NoReconstructionError, listed
 from sfmapp.events import Events
-from sfmapp.option_checks import Range, check_options
 from sfmapp.reporting import Report
 
 STAGE = "carve"
 # level of the subtrees that threads take: up to 512, enough for many threads and few enough to cost nothing
 _SUBTREES = 3
-# cells along the side, at most, of which no number is asked for
-_MOST_CELLS = 256
 # side of the grid of points on which it is found out why nothing is left
 _COARSE = 48
-_RANGES = {"cells": Range(2, 2.0**MAX_DEPTH), "min_views": Range(1), "misses": Range(0, 64)}
 Counts = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class CarveOptions:
-    """Options of space carving.
-
-    Attributes:
-        cells: finest cells along the side of the cube, rounded up to a power of two; None: as fine as outlines are
-            told, see :func:`told_cells`, and 256 at most.
-        min_views: photographs that have to look at a place for anything to be left there; None: half of them. Where
-            fewer look, as beyond the pictures of most, their cones would be left standing; how much was taken away for
-            that is in the report.
-        misses: silhouettes that may miss a place that is kept. Each makes the hull larger.
-        doubts_holes: carve nothing through holes of masks that no other photograph shows, and name them, see
-            :mod:`sfmapp.carve.tolerance`. A gap of the object that one photograph alone looks through is filled.
-    """
-
-    cells: int | None = None
-    min_views: int | None = None
-    misses: int = 0
-    doubts_holes: bool = True
-
-    def __post_init__(self) -> None:
-        check_options(STAGE, self, _RANGES)
-
-    @property
-    def depth(self) -> int:
-        """Level of the finest cells, the most where their number is not given."""
-        return int((self.cells or _MOST_CELLS) - 1).bit_length()
 
 
 class LevelCounts(Report):
@@ -145,7 +113,7 @@ def carve(
 def told_cells(error: float, side: float) -> int:
     """How many cells along the side of a cube outlines tell apart, a power of two: each as large as what the hull's
     surface may be off, units of the world, so that what is smooth is no farther outside than one; 256 at most."""
-    return int(2 ** np.clip(np.floor(np.log2(side / max(error, 1e-9 * side))), 1, np.log2(_MOST_CELLS)))
+    return int(2 ** np.clip(np.floor(np.log2(side / max(error, 1e-9 * side))), 1, np.log2(MOST_CELLS)))
 
 
 def carve_hull(

@@ -34,8 +34,9 @@ from scipy.ndimage import label
 
 from sfmapp.camera import lens
 from sfmapp.carve.hull import hull_of
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.outlines import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, carve_hull
+from sfmapp.carve.space_carving import carve_hull
 from sfmapp.carve.views import View, project_points
 from sfmapp.events import Events
 from sfmapp.reporting import Report

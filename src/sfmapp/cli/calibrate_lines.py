@@ -9,11 +9,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.calibration.lines import LinesResult
@@ -57,7 +57,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def _calibrate(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"images.mask_path": args.mask_path, "seed": args.seed})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.calibration.lines import calibrate_lines
     from sfmapp.workspace.usage import Stopwatch
 

@@ -12,11 +12,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.calibration.rig import RigResult
@@ -72,7 +72,7 @@ def add_way(ways: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def _rig(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"threads": args.threads})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.calibration.boards import parse_board
     from sfmapp.camera.names import CameraModel
     from sfmapp.pipelines.calibration.rig import calibrate_cameras

@@ -12,10 +12,10 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.calibration.point_reports import FitReport, ParameterReport
@@ -123,7 +123,7 @@ def print_fit(fit: FitReport) -> None:
 
 def _calibrate(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.camera.names import CameraModel
     from sfmapp.pipelines.calibration.known_points import calibrate_from_target
     from sfmapp.pipelines.calibration.known_views import calibrate_from_targets, photographs_in

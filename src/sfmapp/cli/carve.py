@@ -10,12 +10,12 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     object_options,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.carve.run import CarveResult
@@ -95,7 +95,7 @@ def _carve(args: argparse.Namespace) -> int:
         "carve.doubts_holes": "false" if args.keep_holes else None, "threads": args.threads,
         "surface.texture": "true" if args.texture else None,
     })  # fmt: skip
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.carve.run import CarveInput, carve
     from sfmapp.workspace.usage import Stopwatch
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
         @property
         def report(self) -> Report: ...
+
+
+# how often Python looks for rubbish
+_USUAL = gc.get_threshold()
 
 
 def add_output_flags(parser: argparse.ArgumentParser, *, has_log: bool = False) -> None:
@@ -68,6 +72,8 @@ def listening(args: argparse.Namespace) -> Iterator[Events]:
     """Events, shown as the flags ask. Ctrl-C, SIGTERM or SIGHUP ends the run at its next step, a second one at once."""
     from sfmapp.events import Events
 
+    gc.freeze()  # what is loaded by now is never rubbish, and not looked through again
+    gc.set_threshold(*_USUAL)
     listener = make_listener(quiet=args.quiet, verbose=args.verbose, as_json=args.json)
     events = Events(listener)
 
@@ -76,6 +82,18 @@ def listening(args: argparse.Namespace) -> Iterator[Events]:
             yield events
         finally:
             listener.close()
+            gc.unfreeze()
+
+
+@contextlib.contextmanager
+def seldom_collecting() -> Iterator[None]:
+    """Until a job begins Python loads a hundred thousand objects that are there to stay; looking for rubbish among them
+    each time that there are a few hundred more is a tenth of that time."""
+    gc.set_threshold(100_000, *_USUAL[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*_USUAL)
 
 
 def print_json(value: Any) -> None:
@@ -113,17 +131,6 @@ def limit_library_threads() -> None:
     would only compete with them for the cores, and would make sums depend on their number."""
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
-
-
-def load_numba_without_blas() -> None:
-    """numba loads all of scipy.linalg for kernels that call BLAS, a fifth of a second and 30 MB; none of ours does.
-    This process is the command's own; a program that imports sfmapp keeps its numba whole."""
-    absent = sys.modules.setdefault("scipy.linalg", None)  # type: ignore[arg-type]
-    try:
-        import numba.np.arraymath  # noqa: F401
-    finally:
-        if absent is None:
-            del sys.modules["scipy.linalg"]
 
 
 def options_of(flags: Mapping[str, str | None]) -> Options:

@@ -11,11 +11,11 @@ from sfmapp.cli.common import (
     limit_library_threads,
     list_options,
     listening,
-    load_numba_without_blas,
     print_contradictions,
     print_json,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.report.model import DenseReport, MeshRunReport
@@ -147,7 +147,7 @@ def _dense(args: argparse.Namespace) -> int:
         "cluster": args.cluster,
     }
     options = _options(args, flags)
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.dense.densify import dense
     from sfmapp.workspace.usage import Stopwatch
 
@@ -174,7 +174,7 @@ def _mesh(args: argparse.Namespace) -> int:
         args.parser.error("-o OUT is needed for a PLY" if is_cloud else "leave out -o: it goes into the workspace")
     flags = {"surface.texture": "true" if args.texture else None, "surface.depth": args.depth}
     options = _options(args, flags)
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.dense.mesh import mesh_cloud, mesh_workspace
     from sfmapp.workspace.usage import Stopwatch
 

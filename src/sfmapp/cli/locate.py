@@ -11,10 +11,10 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     print_json,
     tell_result,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.calibration.known_points import LocateResult
@@ -71,7 +71,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _locate(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     if args.model is not None:
         return _locate_in_model(args)
     from sfmapp.errors import UsageError

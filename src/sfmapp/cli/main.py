@@ -13,6 +13,7 @@ from types import ModuleType
 
 import sfmapp
 from sfmapp import cli
+from sfmapp.cli.common import seldom_collecting
 from sfmapp.cli.signals import signals_interrupt
 from sfmapp.cli.streams import standard_streams
 from sfmapp.errors import InputError, InterruptedRunError, SfmError, refusal
@@ -29,7 +30,7 @@ exit codes: 0 done, 1 a bug, 2 usage, 3 bad input, or out of disk space or memor
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    with standard_streams() as output, signals_interrupt():
+    with standard_streams() as output, signals_interrupt(), seldom_collecting():
         args = make_parser().parse_args(argv)
         code = _run(args)
         output.flush()

@@ -10,12 +10,12 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     object_options,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.carve.masks import MasksResult
@@ -54,7 +54,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _masks(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({**object_options(args), "threads": args.threads})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.carve.masks import MasksInput, find_masks
     from sfmapp.workspace.usage import Stopwatch
 

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfmapp.cli.common import add_output_flags, limit_library_threads, load_numba_without_blas, print_json
+from sfmapp.cli.common import add_output_flags, limit_library_threads, print_json
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.calibration.point_reports import FigureReport
@@ -53,7 +54,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _measure(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.calibration.known_points import MeasureSource, measure_marks
 
     source = MeasureSource(args.pose, args.plane, args.metric, args.camera, args.opencv_pixels)

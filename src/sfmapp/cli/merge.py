@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, load_numba_without_blas, print_json
+from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, print_json
 from sfmapp.cli.reconstruct import print_summary, reconstruction_result
+from sfmapp.kernel_cache import load_numba_sparingly
 
 EXAMPLES = """\
 examples:
@@ -33,7 +34,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _merge(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.sparse.merge import merge_reconstructions
     from sfmapp.workspace.usage import Stopwatch
 

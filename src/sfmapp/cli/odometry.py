@@ -11,11 +11,11 @@ from sfmapp.cli.common import (
     limit_library_threads,
     list_options,
     listening,
-    load_numba_without_blas,
     print_contradictions,
     print_json,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.report.model import OdometryRunReport, RefineReport
@@ -140,7 +140,7 @@ def _odometry(args: argparse.Namespace) -> int:
     if args.sequence is None or args.output is None:
         args.parser.error("SEQUENCE and -o OUT are needed")
     options = _options(args)
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.odometry.track import track_sequence
     from sfmapp.workspace.usage import Stopwatch
 
@@ -170,7 +170,7 @@ def _refine(args: argparse.Namespace) -> int:
 
     flags = {"seed": args.seed, "threads": args.threads}
     options = load_options(args.preset, [*args.set, *(f"{k}={v}" for k, v in flags.items() if v is not None)])
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.odometry.refine import FOLDER, refine
     from sfmapp.workspace.usage import Stopwatch
 

@@ -9,11 +9,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.pair import PairResult
@@ -60,7 +60,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _pair(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"images.camera": args.camera, "images.mask_path": args.mask_path, "seed": args.seed})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.pair import tell_pair
     from sfmapp.workspace.usage import Stopwatch
 

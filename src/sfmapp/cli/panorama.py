@@ -10,12 +10,12 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     print_contradictions,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.panorama.report import PictureReport, TurningReport
@@ -74,7 +74,7 @@ def _panorama(args: argparse.Namespace) -> int:
         "threads": args.threads, "images.mask_path": args.mask_path, "images.focal_px": args.focal_px,
         "seed": args.seed,
     })  # fmt: skip
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.panorama import PictureLayout, stitch_panorama
     from sfmapp.workspace.usage import Stopwatch
 

@@ -6,8 +6,9 @@ import argparse
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from sfmapp.cli.common import add_output_flags, listening, load_numba_without_blas, print_json
+from sfmapp.cli.common import add_output_flags, listening, print_json
 from sfmapp.cli.reconstruct import add_option_flags, effective_options
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.report.plan import PlanReport, StagePlan
@@ -40,7 +41,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _plan(args: argparse.Namespace) -> int:
     options = effective_options(args)
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.planning.plan import plan
     from sfmapp.workspace.usage import Stopwatch
 

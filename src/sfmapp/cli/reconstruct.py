@@ -12,11 +12,11 @@ from sfmapp.cli.common import (
     limit_library_threads,
     list_options,
     listening,
-    load_numba_without_blas,
     print_contradictions,
     print_json,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.report.model import ReconstructionReport
@@ -222,7 +222,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, images: str | list[str], options: Options) -> ReconstructionReport:
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.sparse.add import add_photographs
     from sfmapp.pipelines.sparse.reconstruct import reconstruct
     from sfmapp.workspace.usage import Stopwatch

@@ -9,11 +9,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.stereo.run import StereoResult
@@ -99,7 +99,7 @@ def _stereo(args: argparse.Namespace) -> int:
         "stereo.correct_rig": args.correct,
         "stereo.num_disparities": args.num_disparities, "stereo.window": args.window,
     })  # fmt: skip
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.stereo.run import AlsoWritten, stereo
     from sfmapp.pipelines.stereo.sources import ChosenPairs, KnownCameras
     from sfmapp.workspace.usage import Stopwatch

@@ -11,11 +11,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.sweep.run import SweepResult
@@ -67,7 +67,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _sweep(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"threads": args.threads, "images.mask_path": args.mask_path, "dense.level": args.level})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.sweep.run import sweep
     from sfmapp.workspace.usage import Stopwatch
 

@@ -9,11 +9,11 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.uncalibrated import UncalibratedResult
@@ -59,7 +59,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _uncalibrated(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"threads": args.threads, "images.mask_path": args.mask_path, "seed": args.seed})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.uncalibrated import reconstruct_uncalibrated
     from sfmapp.workspace.usage import Stopwatch
 

@@ -10,12 +10,12 @@ from sfmapp.cli.common import (
     add_output_flags,
     limit_library_threads,
     listening,
-    load_numba_without_blas,
     options_of,
     print_contradictions,
     tell_result,
     took,
 )
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.report.model import UndistortReport
@@ -79,7 +79,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _undistort(args: argparse.Namespace) -> int:
     limit_library_threads()
     options = options_of({"threads": args.threads, "images.mask_path": args.mask_path, "images.camera": args.camera})
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.undistort import undistort
     from sfmapp.scene.undistortion import Layout
     from sfmapp.workspace.usage import Stopwatch

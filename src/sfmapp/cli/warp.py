@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, load_numba_without_blas, tell_result
+from sfmapp.cli.common import add_output_flags, limit_library_threads, listening, tell_result
+from sfmapp.kernel_cache import load_numba_sparingly
 
 if TYPE_CHECKING:
     from sfmapp.pipelines.planes import PlaneSource, RectifyResult, WarpResult
@@ -135,7 +136,7 @@ def _plane_source(args: argparse.Namespace) -> PlaneSource:
 
 def _warp(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.planes import warp
     from sfmapp.planes.warp import Look
     from sfmapp.workspace.usage import Stopwatch
@@ -151,7 +152,7 @@ def _warp(args: argparse.Namespace) -> int:
 
 def _rectify(args: argparse.Namespace) -> int:
     limit_library_threads()
-    load_numba_without_blas()
+    load_numba_sparingly()
     from sfmapp.pipelines.planes import Wanted, rectify
     from sfmapp.workspace.usage import Stopwatch
 

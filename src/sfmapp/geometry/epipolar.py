@@ -22,8 +22,9 @@ Ints = NDArray[np.int64]
 
 
 def essential_from_fundamental(fundamental: Array, k1: Array, k2: Array) -> Array:
-    """The essential matrix nearest to ``K2^T F K1``: singular values (1, 1, 0) over sqrt 2, so of unit norm."""
-    return nearest_essential(k2.T @ fundamental @ k1)
+    """The essential matrices (..., 3, 3) nearest to ``K2^T F K1``: singular values (1, 1, 0) over sqrt 2, so of unit
+    norm."""
+    return nearest_essential(np.swapaxes(k2, -1, -2) @ fundamental @ k1)
 
 
 def fundamental_from_essential(essential: Array, k1: Array, k2: Array) -> Array:
@@ -34,9 +35,9 @@ def fundamental_from_essential(essential: Array, k1: Array, k2: Array) -> Array:
 
 
 def nearest_essential(matrix: Array) -> Array:
-    """The essential matrix nearest in the Frobenius norm up to scale, of unit norm."""
+    """The essential matrices (..., 3, 3) nearest in the Frobenius norm up to scale, of unit norm."""
     u, _, vt = np.linalg.svd(matrix)
-    essential: Array = (u[:, :2] @ vt[:2]) / math.sqrt(2.0)
+    essential: Array = (u[..., :2] @ vt[..., :2, :]) / math.sqrt(2.0)
     return essential
 
 
@@ -194,6 +195,14 @@ def ray_depths(cam2_from_cam1: ArrayLike, xn1: Array, xn2: Array) -> tuple[Array
     return depths, angles
 
 
+def most_in_front(rotations: Array, ts: Array, xn1: Array, xn2: Array) -> int:
+    """Which of K poses, rotations (K, 3, 3) and translations (K, 3) of cam2_from_cam1, has the most points (N, 2), or
+    (N, 3) unit rays, in front of both cameras; the first of equals."""
+    counts = np.empty(len(rotations), np.int64)
+    _count_in_front(*contiguous(rotations, ts), *contiguous(xn1, xn2), counts)
+    return int(np.argmax(counts))
+
+
 def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArray[np.bool_], Array]:
     """The pose that has the most points in front of both cameras.
 
@@ -206,10 +215,7 @@ def choose_in_front(poses: Array, xn1: Array, xn2: Array) -> tuple[Array, NDArra
         The first of equals wins.
     """
     poses = np.asarray(poses, np.float64)
-    counts = np.empty(len(poses), np.int64)
-    rotations, ts = np.ascontiguousarray(rigid3.rotation_matrix(poses)), np.ascontiguousarray(poses[:, 4:])
-    _count_in_front(rotations, ts, *contiguous(xn1, xn2), counts)
-    best = poses[int(np.argmax(counts))]
+    best = poses[most_in_front(rigid3.rotation_matrix(poses), poses[:, 4:], xn1, xn2)]
     depths, angles = ray_depths(best, xn1, xn2)
     return best, (depths[:, 0] > 0) & (depths[:, 1] > 0), angles
 

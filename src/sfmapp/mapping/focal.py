@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera.camera import Camera, pixels_to_normalized
-from sfmapp.geometry import epipolar
+from sfmapp.geometry import epipolar, rigid3
 from sfmapp.geometry.relative_pose import refine_relative_pose
 from sfmapp.mapping.report import FocalReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.tracks import Tracks
+
+Array = NDArray[np.float64]
 
 # Multiples of max(width, height): 120 to 14 degrees of view across the longer side, in steps of 1.38; around the best
 # of them steps of 1.08, about what the first adjustment needs.
@@ -53,12 +55,12 @@ def estimate_focal_ratio(
     pairs = pairs[np.argsort(-correspondences.num_inliers[pairs], kind="stable")][:MAX_PAIRS]
     if len(pairs) == 0:
         return None, FocalReport(num_pairs=0)
-    samples = [_sample(cameras, image_camera_idx, correspondences, tracks, int(pair)) for pair in pairs]
-    coarse = _total_loss(COARSE_RATIOS, samples)
+    samples = [_sample(image_camera_idx, correspondences, tracks, int(pair)) for pair in pairs]
+    coarse = _total_loss(COARSE_RATIOS, cameras, samples)
     fine_ratios = COARSE_RATIOS[np.argmin(coarse)] * FINE_STEPS
-    fine = _total_loss(fine_ratios, samples)
+    fine = _total_loss(fine_ratios, cameras, samples)
     ratio, least = float(fine_ratios[np.argmin(fine)]), float(fine.min())
-    at_default = float(_total_loss(np.array([PRIOR_RATIO]), samples)[0])
+    at_default = float(_total_loss(np.array([PRIOR_RATIO]), cameras, samples)[0])
     report = FocalReport(num_pairs=len(pairs), ratio=ratio, loss=least, loss_at_default=at_default)
     # a log-likelihood ratio of 4.5 is three standard deviations
     return (ratio if at_default - least > 4.5 else None), report
@@ -84,43 +86,45 @@ def matched_pixels(
 
 @dataclass(frozen=True)
 class _Sample:
-    """A pair as the search needs it: its F, its cameras and some of its matched pixels."""
+    """A pair as the search needs it: its F, which cameras took it, and some of its matched pixels."""
 
-    fundamental: NDArray[np.float64]
-    cameras: tuple[Camera, Camera]
-    pixels: tuple[NDArray[np.float64], NDArray[np.float64]]
+    fundamental: Array
+    camera_idx: tuple[int, int]
+    pixels: tuple[Array, Array]
 
 
 def _sample(
-    cameras: list[Camera],
-    image_camera_idx: NDArray[np.int32],
-    correspondences: Correspondences,
-    tracks: Tracks,
-    pair_idx: int,
+    image_camera_idx: NDArray[np.int32], correspondences: Correspondences, tracks: Tracks, pair_idx: int
 ) -> _Sample:
-    first, second = (cameras[image_camera_idx[i]] for i in correspondences.pair_image_idx[pair_idx])
+    first, second = (int(image_camera_idx[i]) for i in correspondences.pair_image_idx[pair_idx])
     xy1, xy2 = matched_pixels(tracks, correspondences, pair_idx)
     step = max(1, len(xy1) // MAX_MATCHES)
     return _Sample(correspondences.fundamental[pair_idx], (first, second), (xy1[::step], xy2[::step]))
 
 
-def _total_loss(ratios: NDArray[np.float64], samples: list[_Sample]) -> NDArray[np.float64]:
+def _total_loss(ratios: Array, cameras: list[Camera], samples: list[_Sample]) -> Array:
     """(K,) negative log of posterior for each trial ratio, up to a constant."""
-    prior = 0.5 * (np.log(ratios / PRIOR_RATIO) / PRIOR_LOG_SIGMA) ** 2
-    return prior + sum((_pair_loss(ratios, sample) for sample in samples), np.zeros(len(ratios)))
+    total: Array = 0.5 * (np.log(ratios / PRIOR_RATIO) / PRIOR_LOG_SIGMA) ** 2
+    total += [_loss(float(ratio), cameras, samples) for ratio in ratios]
+    return total
 
 
-def _pair_loss(ratios: NDArray[np.float64], sample: _Sample) -> NDArray[np.float64]:
-    """(K,) robust negative log-likelihood of the pair's matches for each trial focal length."""
-    loss = np.empty(len(ratios))
-    for k, ratio in enumerate(ratios):
-        trial = [c.with_focal(ratio * max(c.width, c.height)) for c in sample.cameras]
-        focal = 0.5 * (trial[0].focal + trial[1].focal)
-        x1, x2 = (pixels_to_normalized(c, xy) for c, xy in zip(trial, sample.pixels, strict=True))
-        essential = epipolar.essential_from_fundamental(sample.fundamental, trial[0].k_matrix, trial[1].k_matrix)
-        pose, _, _ = epipolar.choose_in_front(epipolar.decompose_essential(essential), x1, x2)
+def _loss(ratio: float, cameras: list[Camera], samples: list[_Sample]) -> float:
+    """Robust negative log-likelihood of the matches of all pairs for a trial focal length."""
+    taking_part = {idx for sample in samples for idx in sample.camera_idx}
+    trials = {i: cameras[i].with_focal(ratio * max(cameras[i].width, cameras[i].height)) for i in taking_part}
+    focals = {i: trial.focal for i, trial in trials.items()}
+    matrices = {i: trial.k_matrix for i, trial in trials.items()}
+    k1, k2 = (np.array([matrices[sample.camera_idx[side]] for sample in samples]) for side in range(2))
+    fundamentals = np.array([sample.fundamental for sample in samples])
+    poses = epipolar.decompose_essential(epipolar.essential_from_fundamental(fundamentals, k1, k2))
+    rotations, loss = rigid3.rotation_matrix(poses), 0.0
+    for n, sample in enumerate(samples):
+        focal = 0.5 * sum(focals[i] for i in sample.camera_idx)
+        x1, x2 = (pixels_to_normalized(trials[i], xy) for i, xy in zip(sample.camera_idx, sample.pixels, strict=True))
+        pose = poses[n, epipolar.most_in_front(rotations[n], poses[n, :, 4:], x1, x2)]
         # keypoints are good to about a pixel; a smaller scale would call model errors such as distortion evidence
         pose = refine_relative_pose(pose, x1, x2, 1.0 / focal, max_iterations=4)
         squared = epipolar.sampson_errors(epipolar.essential_from_pose(pose), x1, x2) * focal**2
-        loss[k] = np.log1p(squared).sum()
+        loss += float(np.log1p(squared).sum())
     return loss

@@ -103,7 +103,6 @@ def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
 
     wall, cpu = time.monotonic(), time.thread_time()
     helper = _Helper(modules, events)
-    gc.freeze()  # what numba builds and drops has Python look for rubbish among all that there is, again and again
     listener = _listener(events, helper)
     numba_event.register("numba:compile", listener)
     try:
@@ -120,7 +119,8 @@ def _compile(events: Events, modules: tuple[str, ...]) -> Usage:
     except Exception as error:  # whoever calls the kernel next meets the same error, where it belongs
         events.warned(STAGE, f"compiling ahead failed: {type(error).__name__}: {error}")
     finally:
-        gc.unfreeze()
+        if listener.num_compiled:
+            gc.unfreeze()
         helper.stop()
         numba_event.unregister("numba:compile", listener)
     num_compiled = listener.num_compiled + helper.num_compiled
@@ -218,6 +218,8 @@ def _listener(events: Events, helper: _Helper) -> Any:
 
         def on_start(self, event: Event) -> None:
             if not self.num_compiled:
+                # what numba builds and drops has Python look for rubbish among all that there is, again and again
+                gc.freeze()
                 events.started(STAGE, "compiling kernels, once")
                 helper.wake()
             self.num_compiled += 1

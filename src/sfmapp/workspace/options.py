@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.carve.silhouettes import MaskOptions
-from sfmapp.carve.space_carving import CarveOptions
+from sfmapp.carve.options import CarveOptions, MaskOptions
 from sfmapp.cluster.address import num_local
 from sfmapp.dense.options import DenseOptions
 from sfmapp.errors import SfmError, UsageError

@@ -16,8 +16,9 @@ from sfmapp.carve.files import read_octree, write_octree
 from sfmapp.carve.hull import Hull, hull_of, outline_error
 from sfmapp.carve.isosurface import Distance, Normals
 from sfmapp.carve.octree import Octree
+from sfmapp.carve.options import CarveOptions
 from sfmapp.carve.silhouettes import Silhouette
-from sfmapp.carve.space_carving import CarveOptions, CarvingReport, carve_hull, told_cells
+from sfmapp.carve.space_carving import CarvingReport, carve_hull, told_cells
 from sfmapp.carve.swept_sights import SightsReport
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events

@@ -30,7 +30,7 @@ class KnownLength:
     ids: tuple[int, int] | None = None
 
 
-def parse_known_lengths(text: str | None, names: Sequence[str]) -> list[KnownLength]:
+def parse_known_lengths(text: str, names: Sequence[str]) -> list[KnownLength]:
     """Known lengths of an option.
 
     Args:
@@ -39,7 +39,7 @@ def parse_known_lengths(text: str | None, names: Sequence[str]) -> list[KnownLen
     Raises:
         UsageError: one is none of the forms, or names no image.
     """
-    return [_parse(part.strip(), names) for part in (text or "").split(";") if part.strip()]
+    return [_parse(part.strip(), names) for part in text.split(";") if part.strip()]
 
 
 def _parse(text: str, names: Sequence[str]) -> KnownLength:

@@ -22,7 +22,6 @@ from sfmapp.pipelines.sparse.photographs import link_photographs
 from sfmapp.report.drawing import jpeg_url
 from sfmapp.report.video_html import frames_of_strip
 from sfmapp.reporting import from_plain, to_json
-from sfmapp.video.frames import STAGE, choose_frames
 from sfmapp.video.options import VideoOptions
 from sfmapp.video.report import VideoReport
 from sfmapp.workspace.keys import stage_key
@@ -112,6 +111,8 @@ def frames_and_photographs(
 
 def _frames_of(video: Path, folder: Path, options: VideoOptions, events: Events) -> VideoReport:
     """What was chosen of a video before, where that still holds; else it is chosen now."""
+    from sfmapp.video.frames import STAGE, choose_frames
+
     status = video.stat()
     key = stage_key(_ENTRIES, options, os.fspath(video), status.st_size, status.st_mtime_ns)
     known = read_json(folder / _CHOSEN)

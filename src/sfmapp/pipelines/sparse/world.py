@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from sfmapp.errors import UsageError
 from sfmapp.formats.control_points import ControlPoints, read_control_points
 from sfmapp.pipelines.sparse.keys import StageKeys, stage_keys
-from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
 from sfmapp.pipelines.sparse.run import Run
 
 if TYPE_CHECKING:
@@ -29,7 +28,10 @@ def read_world(run: Run, image_set: ImageSet) -> StageKeys:
     """
     run.control = read_control(run, image_set)
     run.poses = read_known_poses(run, image_set)
-    run.known = parse_known_lengths(run.options.units.known, image_set.names)
+    if run.options.units.known is not None:
+        from sfmapp.pipelines.sparse.known_lengths import parse_known_lengths
+
+        run.known = parse_known_lengths(run.options.units.known, image_set.names)
     return stage_keys(run.options, image_set, run.control, run.poses)
 
 
