@@ -31,6 +31,7 @@ from sfmapp.odometry.loops.relocalize import (
     relocalize,
     twist,
 )
+from sfmapp.odometry.loops.repetition import Repetition
 from sfmapp.odometry.loops.rivals import are_seen_apart, believe_place, log_ratio_of_shift
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.map.local_map import View as FrameView
@@ -338,12 +339,14 @@ def test_the_same_poster_elsewhere_is_refused(walked: tuple[KeyframeMap, PlaceIn
     assert relocalize({0: keyframes}, places, View(image, corners(image)), OPTIONS)
 
 
-def believed(walker: Walker, places: PlaceIndex, pose: Array, timestamp_s: float) -> tuple[int, float | None]:
+def believed(
+    walker: Walker, places: PlaceIndex, pose: Array, timestamp_s: float, repetition: Repetition
+) -> tuple[int, float | None]:  # fmt: skip
     """How many places an image fits that is seen at a time, and by how many metres the one that is believed is off."""
     image = walker.wall.photograph(pose, 999)
     maps, view = {0: walker.keyframes}, View(image, corners(image))
     fitting = relocalize(maps, places, view, OPTIONS)
-    found = believe_place(fitting, maps, places, view, timestamp_s, OPTIONS)
+    found = believe_place(fitting, maps, places, view, timestamp_s, OPTIONS, repetition)
     off = None if found is None else rigid3.center(found.located.cam_from_world) - rigid3.center(pose)
     return len(fitting), None if off is None else float(np.linalg.norm(off))
 
@@ -361,10 +364,53 @@ def test_a_lost_image_is_placed_where_nothing_else_can_be(wall: Wall) -> None:
             keyframe = walker.step(n, pose_at(4.0 + 0.3 * n, 4.0))
             if n % 5 == 0:
                 walker.add_to(places, keyframe)
-        num_fitting, off = believed(walker, places, pose_at(x, 4.1), 0.1 * (num + 4))
+        num_fitting, off = believed(walker, places, pose_at(x, 4.1), 0.1 * (num + 4), Repetition())
         assert num_fitting >= 1
         assert (off is not None) == is_believed
         assert off is None or off < 0.03
+
+
+def test_a_carried_image_is_placed_where_the_map_has_shown_that_it_does_not_repeat_itself(wall: Wall) -> None:
+    """What is in view has its like in part, so landmarks alone do not tell; that no place fits another one does."""
+    half = wall.image.copy()
+    half[475:, 1200:1680] = half[475:, 320:800]  # lower halves of two stretches, 11 m apart
+    bays = np.tile(wall.image[:, 320:640], (1, 6))
+    for image, num_single, num_repeated in ((half, 12, 0), (bays, 0, 12)):
+        walker, places, finder = Walker(Wall(image)), PlaceIndex(), LoopFinder()
+        for n in range(30):
+            keyframe = walker.step(n, pose_at(4 + 0.6 * n, 5.5))
+            finder.find({0: walker.keyframes}, 0, places, n, walker.add_to(places, keyframe))
+        asked, likes = finder.repetition._asked, finder.repetition._likes
+        assert len(asked.difference(likes)) >= num_single
+        assert len(likes) >= num_repeated
+        assert num_single == 0 or not likes
+        by_maps = finder.repetition.log_ratio([walker.keyframes], 3)
+        assert by_maps == pytest.approx(0.0 if num_repeated else len(asked) * math.log(2.0))
+        there, ends_s = pose_at(6.1, 5.6), 0.1 * 40
+        assert believed(walker, places, there, ends_s, Repetition())[1] is None
+        off = believed(walker, places, there, ends_s, finder.repetition)[1]
+        assert off is None if num_repeated else off is not None and off < 0.03
+
+
+def test_a_map_says_nothing_of_its_likes_before_it_has_other_places() -> None:
+    keyframes, repetition = KeyframeMap(Rig.single(CAMERA)), Repetition()
+    for n in range(20):
+        ids = keyframes.new_points(3)
+        keyframes.append(Keyframe(n, 0.0, str(n), rigid3.IDENTITY, ids, np.zeros((3, 1, 2)), np.ones((3, 1), bool)))
+        repetition.ask(n, n)
+    maps = [keyframes]
+    assert repetition.log_ratio(maps, 0) == pytest.approx(15 * math.log(2.0))  # five have too few others
+    for n, other in ((8, 2), (12, 6), (13, 6)):
+        repetition.note_like(n, other)
+    some = repetition.log_ratio(maps, 0)  # 8, 12, 13, 2 and 6 are there twice, and 11 once
+    assert some == pytest.approx(binom.logpmf(11, 16, 11 / 16) - binom.logpmf(11, 16, 0.5))
+    assert repetition.log_ratio(maps, 12) == repetition.log_ratio(maps, 2) == 0.0
+    repetition.forgive([8, 12])
+    assert repetition.log_ratio(maps, 0) == pytest.approx(binom.logpmf(11, 13, 11 / 13) - binom.logpmf(11, 13, 0.5))
+    for n in range(15, 20):
+        repetition.note_like(n, n - 6)
+    assert repetition.log_ratio(maps, 0) == 0.0
+    assert repetition.log_ratio([KeyframeMap(Rig.single(CAMERA))], 0) == 0.0
 
 
 def test_a_gap_leads_where_the_camera_can_have_come() -> None:
@@ -479,6 +525,7 @@ def test_a_loop_is_closed(wall: Wall) -> None:
         np.linalg.norm(rigid3.center(ground_truth[views[0].new_idx]) - rigid3.center(ground_truth[views[0].old_idx]))
         < 1.5
     )
+    assert not finder.repetition._likes  # what is a loop is no like
     # the similarity is that of the drift between both sides
     true = similarity.compose(moves[views[-1].old_idx], similarity.inverse(moves[views[-1].new_idx]))
     center = rigid3.center(keyframes.keyframes[-1].rig_from_world)

@@ -207,7 +207,9 @@ class Recognition:
                 found = self._find_known(known, seen, roll)
         if found is None:
             fitting = relocalize(keyframes, self._places, seen, options, roll)
-            found = believe_place(fitting, keyframes, self._places, seen, view.timestamp_s, options)
+            found = believe_place(
+                fitting, keyframes, self._places, seen, view.timestamp_s, options, self._finder.repetition
+            )
         if found is None:
             return None
         located = found.located

@@ -27,6 +27,7 @@ from sfmapp.odometry.loops.relocalize import (
     Located,
     RelocalizeOptions,
     is_convincing,
+    is_elsewhere,
     local_points,
     locate,
     locate_near,
@@ -34,6 +35,7 @@ from sfmapp.odometry.loops.relocalize import (
     shared_points,
     twist,
 )
+from sfmapp.odometry.loops.repetition import Repetition
 from sfmapp.odometry.loops.rivals import LoopEvidence, are_seen_apart
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 
@@ -122,7 +124,7 @@ class _Suspicion:
         """Too much is missing where it leads."""
         return self.evidence is not None and self.evidence.is_contradicted
 
-    def is_certain(self, keyframes: KeyframeMap, old_map: KeyframeMap) -> bool:
+    def is_certain(self, keyframes: KeyframeMap, old_map: KeyframeMap, repetition: Repetition) -> bool:
         """It does not lead to the like of its place."""
         if self.evidence is None:
             return True
@@ -130,7 +132,8 @@ class _Suspicion:
         if old_map is keyframes:
             return self.evidence.is_certain_by_drift(self.shift(keyframes) / keyframe_depths(keyframes)[view.new_idx])
         ways, depth = (way_of(old_map), way_of(keyframes, self.old_from_new)), keyframe_depths(old_map)[view.old_idx]
-        return self.evidence.is_certain_by_way(log_ratio_of_seam(*ways, float(depth)))
+        by_maps = repetition.log_ratio((old_map, keyframes), old_map.keyframes[view.old_idx].frame_idx)
+        return self.evidence.is_certain_by_way(log_ratio_of_seam(*ways, float(depth)), by_maps)
 
     def shift(self, keyframes: KeyframeMap) -> float:
         """By how much it moves the newest keyframe that saw it."""
@@ -143,10 +146,11 @@ class LoopFinder:
 
     Attributes:
         num_open: loops that were seen often enough and may lead to the like of their place.
+        repetition: what was found of the likes of places in their own maps.
     """
 
     def __init__(self, options: LoopOptions = LoopOptions()) -> None:
-        self.options, self.num_open = options, 0
+        self.options, self.num_open, self.repetition = options, 0, Repetition()
         self._suspicion: _Suspicion | None = None
 
     @property
@@ -181,7 +185,10 @@ class LoopFinder:
         new_idx = position_of(keyframes, frame_idx)
         if self._suspicion is not None:
             return self._confirm(maps, map_idx, places, new_idx, view)
-        candidates = places.query(frame_idx, self._neighbors(keyframes, new_idx))
+        neighbors = self._neighbors(keyframes, new_idx)
+        others = {k.frame_idx for k in keyframes.keyframes if k.frame_idx in places}.difference(neighbors)
+        self.repetition.ask(frame_idx, len(others))
+        candidates = places.query(frame_idx, neighbors)
         candidates += places.query(frame_idx, other_maps=True)
         found: list[_Suspicion] = []
         for candidate in candidates:
@@ -206,6 +213,8 @@ class LoopFinder:
         located = locate(old_map, places, view, candidate, options.relocalize, roll)
         if located is None or not is_convincing(located, view, options.relocalize):
             return None
+        if old_map is keyframes:
+            self._note_like(keyframes, new_idx, old_idx, located.cam_from_world)
         seen = seen_in(old_map, places, view, (new_idx, old_idx), located, options.relocalize)
         start = initial_similarity(keyframes, seen, options)
         if start is None:
@@ -237,6 +246,8 @@ class LoopFinder:
                 suspicion.old_map, suspicion.old_from_new, [*suspicion.views, seen], evidence=suspicion.evidence
             )
             if self._fits(maps, map_idx, trial):
+                if old_map is keyframes:
+                    self._note_like(keyframes, new_idx, seen.old_idx, seen.located.cam_from_world)
                 if trial.evidence is not None:
                     trial.evidence.look(view, seen.old_idx, seen.located.cam_from_world)
                 return self._judge(maps, map_idx, trial)
@@ -252,7 +263,7 @@ class LoopFinder:
         if self._suspicion is None or num < options.min_views:
             return None
         agrees = bool(np.mean([v.located.agreement for v in trial.views]) >= options.min_agreement)
-        is_certain = agrees and trial.is_certain(maps[map_idx], maps[trial.old_map])
+        is_certain = agrees and trial.is_certain(maps[map_idx], maps[trial.old_map], self.repetition)
         if num == options.min_views:
             self.num_open += agrees and not is_certain
         else:  # it has been open
@@ -270,6 +281,12 @@ class LoopFinder:
         if located is None or not is_convincing(located, view, options):
             return None
         return seen_in(old_map, places, view, (new_idx, old_idx), located, options)
+
+    def _note_like(self, keyframes: KeyframeMap, new_idx: int, old_idx: int, pose: Array) -> None:
+        """A keyframe fits its map at an old one, where a pose (7,) puts it."""
+        keyframe, depth = keyframes.keyframes[new_idx], float(keyframe_depths(keyframes)[new_idx])
+        if is_elsewhere(keyframe.rig_from_world, pose, depth):
+            self.repetition.note_like(keyframe.frame_idx, keyframes.keyframes[old_idx].frame_idx)
 
     def _neighbors(self, keyframes: KeyframeMap, new_idx: int) -> list[int]:
         """Frames that are no loop with a keyframe: those just before it and those that see the same points."""
@@ -299,6 +316,7 @@ class LoopFinder:
 
     def _closure(self, maps: Mapping[int, KeyframeMap], map_idx: int, suspicion: _Suspicion) -> LoopClosure:
         keyframes, old_map = maps[map_idx], maps[suspicion.old_map]
+        self.repetition.forgive(keyframes.keyframes[v.new_idx].frame_idx for v in suspicion.views)
         system = _LoopSystem(keyframes, old_map, suspicion.views)
         limit = self.options.relocalize.error_px(keyframes.rig.cameras[0])
         error = np.linalg.norm(system.forward(suspicion.old_from_new), axis=1)

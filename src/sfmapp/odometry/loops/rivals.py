@@ -38,6 +38,7 @@ from sfmapp.odometry.loops.relocalize import (
     position_of,
     seen_as_before,
 )
+from sfmapp.odometry.loops.repetition import Repetition
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
 
 Array = NDArray[np.float64]
@@ -102,19 +103,20 @@ class LoopEvidence:
         """
         return self._outweighs(log_ratio_of_shift(shift), _UNFOUND)
 
-    def is_certain_by_way(self, by_way: float | None) -> bool:
+    def is_certain_by_way(self, by_way: float | None, by_maps: float) -> bool:
         """The same where a camera was not seen for a while.
 
         Args:
             by_way: as of :func:`log_ratio_of_gap`. Where the way may lead to several look-alikes, or not there at all
                 (None), any place of the map is as likely beforehand, and the map must show that it does not repeat
                 itself, as otherwise it may do so where it has not been seen.
+            by_maps: as of :meth:`Repetition.log_ratio`.
         """
         if by_way is not None and by_way >= 0.0:
             return self._outweighs(by_way, _UNFOUND)
         if by_way is None and self._num_places < _MIN_PLACES:
             return False
-        anywhere = log_prior(self._num_places) - math.log(NOT_IN_MAP)
+        anywhere = log_prior(self._num_places) - math.log(NOT_IN_MAP) + by_maps
         return self._outweighs(anywhere, _UNSEEN if by_way is None else _MAY_BE_UNSEEN)
 
     def _outweighs(self, where: float, unfound: float) -> bool:
@@ -136,12 +138,12 @@ class LoopEvidence:
 
 def believe_place(
     fitting: Sequence[Relocalization], maps: Mapping[int, KeyframeMap], places: PlaceIndex, view: View,
-    timestamp_s: float, options: RelocalizeOptions,
+    timestamp_s: float, options: RelocalizeOptions, repetition: Repetition,
 ) -> Relocalization | None:  # fmt: skip
     """Of the places that a lost image fits the one where most is found and least is missing, if it is certain.
 
     Args:
-        fitting: as of :func:`relocalize`. timestamp_s: when the image was taken.
+        fitting: as of :func:`relocalize`. timestamp_s: when the image was taken. repetition: of the maps.
     """
     judged = []
     for found in fitting:
@@ -156,7 +158,7 @@ def believe_place(
         return None
     way, depth = way_of(keyframes).before(timestamp_s), float(keyframe_depths(keyframes)[position])
     by_way = log_ratio_of_gap(way, timestamp_s, rigid3.center(found.located.cam_from_world), depth)
-    return found if evidence.is_certain_by_way(by_way) else None
+    return found if evidence.is_certain_by_way(by_way, repetition.log_ratio((keyframes,), found.frame_idx)) else None
 
 
 def log_ratio_of_shift(shift: float) -> float:
