@@ -106,6 +106,11 @@ class Events:
         """A stop was asked for."""
         return self._cancelled.is_set()
 
+    @property
+    def is_heard(self) -> bool:
+        """Somebody listens."""
+        return bool(self._listeners)
+
     def without_cancellation(self) -> Events:
         """The same line to the same listeners without the wish to stop: for a stage that ends by itself, whole, when
         what it works on ends early."""

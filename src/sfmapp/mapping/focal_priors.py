@@ -10,7 +10,7 @@ there it is the adjusted value that is not believed, and the prior has the say t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,14 @@ from sfmapp.images.exif import DEFAULT_FOCAL, DEFAULT_FOCAL_SIGMA
 from sfmapp.mapping import structure
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.register import Registration
-from sfmapp.mapping.report import AgreeingObservations, FocalEvidence, FocalReport, StartReport, Uncertainty
+from sfmapp.mapping.report import (
+    AgreeingObservations,
+    FocalEvidence,
+    FocalReport,
+    PartsReport,
+    StartReport,
+    Uncertainty,
+)
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -65,6 +72,8 @@ class Mapped:
     """Of each model why it is not one with another."""
     enough: float
     """Share of the matches that has to agree with a model of these pairs, so that no other start is tried."""
+    parts: PartsReport = field(default_factory=PartsReport)
+    """Those that it was mapped in, if any."""
     without_prior: tuple[int, ...] = ()
     """Cameras that it began with as unknown although a focal length was given."""
 

@@ -21,10 +21,13 @@ from sfmapp.camera.camera import Camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
+from sfmapp.executor import Executor as WorkExecutor
+from sfmapp.executor import Threads
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import verified_pairs
 from sfmapp.mapping.carry import carried
 from sfmapp.mapping.closing_move import closing_move, widened_by_move
+from sfmapp.mapping.divided import Divided, InParts
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
@@ -37,7 +40,15 @@ from sfmapp.mapping.one_place import OnePlace, find_one_place
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import NextImages, Registration
 from sfmapp.mapping.repair import repaired
-from sfmapp.mapping.report import FocalReport, InitialPairReport, MappedImage, MappingReport, ModelReport, StartReport
+from sfmapp.mapping.report import (
+    FocalReport,
+    InitialPairReport,
+    MappedImage,
+    MappingReport,
+    ModelReport,
+    StartReport,
+)
+from sfmapp.mapping.submaps import Part
 from sfmapp.mapping.tracks import build_tracks, track_colors
 from sfmapp.mapping.verified_pairs import contradictions_of
 from sfmapp.scene.correspondences import Correspondences
@@ -60,18 +71,20 @@ SAME_AGREEMENT = 0.005
 
 @dataclass(frozen=True)
 class Ends:
-    """What mapping begins with and ends in, beside what it does itself.
+    """What mapping begins with and ends in, beside what it does itself, and who does it.
 
     Attributes:
         start: finished models of some of the images, known by their names, that mapping goes on with. Where the
             photographs turn out not to believe a focal length, or which parts are one, it begins anew.
         is_apart: images of one of them come to another with it, by the similarity between them, and not one by one.
         closing: called in the end with the finished models, the largest first, to move and adjust them further.
+        executor: who maps the parts of large sets; None: threads of this process.
     """
 
     start: Sequence[Reconstruction] = ()
     is_apart: bool = False
     closing: Callable[[list[Mapper]], None] | None = None
+    executor: WorkExecutor | None = None
 
 
 def map_images(
@@ -116,7 +129,10 @@ def map_images(
         )
     events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
-        task = _Task(names, image_camera_idx, options, adjust_options, events, pool, threads)
+        by_parts = InParts(
+            ends.executor or Threads(threads), partial(map_part, options, adjust_options, events.unheard())
+        )
+        task = _Task(names, image_camera_idx, options, adjust_options, events, pool, threads, by_parts)
 
         def map_all(given: list[Camera]) -> Mapped:
             return task.map_from(given, correspondences, tracks)
@@ -151,6 +167,7 @@ def map_images(
         focal=mapped.focal_report,
         look_alikes=look_alikes,
         initial_pairs=mapped.initial_reports,
+        parts=mapped.parts,
         images=image_reports(names, models, mapped.attempts),
         models=model_reports,
     )
@@ -172,6 +189,8 @@ class _Task:
     events: Events
     pool: Executor
     threads: int
+    in_parts: InParts | None = None
+    """How large sets are mapped in parts; None: they are not."""
 
     def map_from(
         self, given: list[Camera], correspondences: Correspondences, tracks: Tracks,
@@ -196,11 +215,30 @@ class _Task:
         begun = [carried(model, empty) for model in ends.start] if ends is not None else []
         is_apart = ends is not None and ends.is_apart
         starts = Starts(options, events, enough)
+        divided = Divided([])
+        if self.in_parts is not None and not begun:
+            divided = self.in_parts.models(empty, correspondences, mapper_of)
+            begun = divided.models
         models, initial_reports = _grow_models(empty, mapper_of, starts, begun, is_apart=is_apart)
+        if divided.models and divided.is_bent(models, correspondences):
+            events.warned(STAGE, "parts do not make a model that holds together: mapping all images as a whole")
+            models, initial_reports = _grow_models(empty, mapper_of, starts)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)
         models = [repaired(model, correspondences, mapper_of, options, events) for model in models]
-        return Mapped(cameras, models, initial_reports, focal_report, attempts, mapper_of, apart, starts.enough)
+        return Mapped(
+            cameras, models, initial_reports, focal_report, attempts, mapper_of, apart, starts.enough, divided.report
+        )
+
+
+def map_part(
+    options: MappingOptions, adjust_options: AdjustOptions, events: Events, part: Part
+) -> list[Reconstruction]:
+    """Models of a part of a large set, the largest first, by one thread."""
+    options = replace(options, estimate_focal=False)
+    with ThreadPoolExecutor(1) as pool:
+        task = _Task(part.image_names, part.image_camera_idx, options, adjust_options, events, pool, 1)
+        return task.map_from(part.cameras, part.correspondences, part.tracks).models
 
 
 def _model_report(

@@ -688,6 +688,8 @@ class Mapper:
 
     def _tell(self, message: str) -> None:
         """Tell what the model looks like, with the images that have come since that was told."""
+        if not self.events.is_heard:  # looking takes all observations
+            return
         summary = self.reconstruction.summary()
         self.events.decided(
             STAGE, f"{message}; {summary.num_points} points, {summary.mean_reprojection_error_px:.2f} px",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import field
 from typing import Literal
 
 from sfmapp.adjust.options import AdjustReport
@@ -195,6 +196,43 @@ class ModelReport(ModelEntry):
     adjustment: AdjustReport | None = None
 
 
+class SubmapReport(Report):
+    """A model of one part of the images; ``reason``: why it is not in that of all, empty if it is."""
+
+    first_image: str
+    num_images: int
+    num_images_of_part: int
+    reason: str
+
+
+class SeamReport(Report):
+    """How two submaps agree that share images.
+
+    Attributes:
+        submaps: their positions.
+        num_images, num_elsewhere: those that both hold, and of these such as they put at different places.
+        num_points, num_points_agreeing: points of the one that images of the other alone see, and those that are where
+            these see them.
+        sigmas: rms of what both say differently, in standard deviations of both; absent where that was not come to.
+        reason: why they were not joined by it; empty if they were.
+    """
+
+    submaps: Sequence[int]
+    num_images: int
+    num_elsewhere: int
+    num_points: int
+    num_points_agreeing: int
+    sigmas: float | None
+    reason: str
+
+
+class PartsReport(Report):
+    """A set of images that was mapped in parts; empty where it was mapped as a whole."""
+
+    submaps: Sequence[SubmapReport] | None = None
+    seams: Sequence[SeamReport] | None = None
+
+
 class MappingReport(Report):
     """What the stage ``mapping`` did; the largest model comes first."""
 
@@ -202,5 +240,6 @@ class MappingReport(Report):
     focal: FocalReport
     look_alikes: LookAlikesReport
     initial_pairs: Sequence[StartReport]
+    parts: PartsReport = field(default_factory=PartsReport)
     images: Sequence[MappedImage]
     models: Sequence[ModelReport]

@@ -1,0 +1,217 @@
+"""A large set of images mapped in parts: divided, each part by itself, and what agrees put together as one model.
+
+What comes of it is where mapping goes on: images that no part holds, or that stand against their neighbours, are then
+registered as any others are, and all is adjusted together. No part's failure is one of the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from sfmapp.events import Events
+from sfmapp.executor import Executor
+from sfmapp.mapping.assembly import Assembly, assemble, union
+from sfmapp.mapping.division import divide
+from sfmapp.mapping.mapper import STAGE, Mapper
+from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.report import PartsReport, SeamReport, SubmapReport
+from sfmapp.mapping.seams import Seam, find_common, fit_seam, joint_covariances
+from sfmapp.mapping.submaps import Part, Submap
+from sfmapp.mapping.tracks import USELESS_CONFIGS
+from sfmapp.mapping.verified_pairs import pair_agreement
+from sfmapp.scene.correspondences import Correspondences
+from sfmapp.scene.reconstruction import Reconstruction
+
+_STEP = "mapping parts"
+
+
+# Fewer images are mapped as quickly as a whole: of a rendered town 500 were, and 1,000 nearly so.
+FEWEST = 1000
+# So large a share of the verified matches may agree with submaps and not with the model of all: of a rendered town it
+# is 0.00002, and two maps are taken for the same up to this difference where starts are compared too.
+MAX_LOST_AGREEMENT = 0.005
+
+
+@dataclass(frozen=True)
+class Divided:
+    """What mapping in parts has brought.
+
+    Attributes:
+        models: of submaps that agree, the largest first; none where images are to be mapped as a whole.
+        report: of the parts, empty where there are none.
+        submaps: all of them.
+    """
+
+    models: list[Reconstruction]
+    report: PartsReport = field(default_factory=PartsReport)
+    submaps: list[Submap] = field(default_factory=list)
+
+    def is_bent(self, models: Sequence[Reconstruction], correspondences: Correspondences) -> bool:
+        """Whether fewer of the verified matches agree with finished models than do with submaps: then parts that look
+        alike were put together, or a wrong one has bent the others."""
+        whole = [pair_agreement(model, correspondences) for model in models]
+        apart = [pair_agreement(submap.model, submap.part.correspondences) for submap in self.submaps]
+        agreeing = [
+            sum(int(f.num_agreeing.sum()) for f in found) / max(sum(int(f.num_matches.sum()) for f in found), 1)
+            for found in (whole, apart)
+        ]
+        return agreeing[0] < agreeing[1] - MAX_LOST_AGREEMENT
+
+
+@dataclass(frozen=True)
+class InParts:
+    """How a large set is mapped in parts.
+
+    Attributes:
+        executor: who maps them.
+        map_part: makes the models of one, the largest first.
+    """
+
+    executor: Executor
+    map_part: Callable[[Part], list[Reconstruction]]
+
+    def models(
+        self, empty: Reconstruction, correspondences: Correspondences, mapper_of: Callable[[Reconstruction], Mapper]
+    ) -> Divided:
+        """Models of what the parts of a set agree on.
+
+        Args:
+            empty: all images, their cameras and tracks; nothing of it is changed.
+            mapper_of: of a model of all images, whose options and events are those of the parts.
+        """
+        parts = parts_of(empty, correspondences) if len(empty.image_names) >= FEWEST else []
+        if not parts:
+            return Divided([])
+        mapper = mapper_of(empty)
+        submaps = self._mapped(parts, mapper.events)
+        models, report = joined(submaps, empty, partial(_mapper_of_part, mapper), mapper.options, mapper.events)
+        for model in models:
+            _set_up(model, mapper_of(model))
+        return Divided(models, report, submaps)
+
+    def _mapped(self, parts: Sequence[Part], events: Events) -> list[Submap]:
+        """What the parts come to, in their order, whoever is done first."""
+        sizes = [len(part.image_idx) for part in parts]
+        found: dict[int, list[Reconstruction]] = {}
+        events.started(_STEP, f"{len(parts)} parts of {min(sizes)} to {max(sizes)} images", total=len(parts))
+        with closing(self.executor.run(self.map_part, parts)) as answers:
+            for n, models in answers:
+                found[n] = models
+                registered = [int(model.is_registered.sum()) for model in models]
+                text = f"{' + '.join(map(str, registered)) or 'none'} of {sizes[n]} images of part {n}"
+                events.decided(STAGE, text)
+                events.advanced(_STEP, message=text)
+        events.finished(_STEP)
+        return [Submap(part, model) for n, part in enumerate(parts) for model in found[n]]
+
+
+def parts_of(empty: Reconstruction, correspondences: Correspondences) -> list[Part]:
+    """The parts in which images are to be mapped; none where they are better mapped as a whole."""
+    is_useful = ~np.isin(correspondences.config, USELESS_CONFIGS)
+    num_matches = np.where(is_useful, correspondences.num_inliers, 0)
+    divided = divide(len(empty.image_names), correspondences.pair_image_idx, num_matches)
+    return [Part.of(empty, correspondences, images) for images in divided] if len(divided) > 1 else []
+
+
+def _mapper_of_part(like: Mapper, submap: Submap) -> Mapper:
+    part = submap.part
+    return replace(
+        like, reconstruction=submap.model, correspondences=part.correspondences, prior_cameras=list(part.cameras),
+        locked=np.zeros(len(part.image_idx), bool),
+    )  # fmt: skip
+
+
+def _set_up(model: Reconstruction, mapper: Mapper) -> None:
+    """Give a model of several parts its points, and bring it to rest where images are to be registered in it."""
+    # where parts meet, as far off as these may have drifted
+    mapper.max_error_px = mapper.options.max_pose_error_px
+    mapper.triangulate_images(model.registered_idx.tolist())
+    if not model.is_registered.all():
+        mapper.adjust_globally()
+
+
+def joined(
+    submaps: Sequence[Submap], empty: Reconstruction, mapper_of_part: Callable[[Submap], Mapper],
+    options: MappingOptions, events: Events,
+) -> tuple[list[Reconstruction], PartsReport]:  # fmt: skip
+    """Models of submaps that agree, without points yet, the largest first, and what is to be said of all.
+
+    Submaps that share images with a larger model and have no part in it are left out: their images are free.
+
+    Args:
+        empty: all images, their cameras and tracks; nothing of it is changed.
+        mapper_of_part: knows what varied in a submap's model.
+    """
+    seams = find_seams(submaps, mapper_of_part, options)
+    worlds, seams = assemble(submaps, seams)
+    kept: list[Assembly] = []
+    reasons: dict[int, str] = {}
+    for world in worlds:
+        against = _reason_against(world, kept, seams)
+        if not against:
+            kept.append(world)
+            continue
+        for n in world.members:
+            reasons[n] = f"it is not one with {against}"
+            images = submaps[n].registered_idx
+            events.warned(
+                STAGE,
+                f"submap {n} ({empty.image_names[images[0]]} and {len(images) - 1} more images) is left out, and its "
+                f"images are registered anew from where its neighbours are: {reasons[n]}",
+            )
+    report = PartsReport(
+        submaps=[
+            SubmapReport(
+                first_image=empty.image_names[s.registered_idx[0]], num_images=len(s.registered_idx),
+                num_images_of_part=len(s.part.image_idx), reason=reasons.get(n, ""),
+            )
+            for n, s in enumerate(submaps)
+        ],
+        seams=[
+            SeamReport(
+                submaps=list(seam.submaps), num_images=len(seam.image_idx), num_elsewhere=int(seam.is_off.sum()),
+                num_points=seam.num_points, num_points_agreeing=seam.num_seen, sigmas=seam.sigmas, reason=seam.reason,
+            )
+            for seam in seams
+        ],
+    )  # fmt: skip
+    events.decided(
+        STAGE,
+        f"{len(submaps) - len(reasons)} of {len(submaps)} submaps are one, by {sum(not s.reason for s in seams)} seams",
+        **report,
+    )  # fmt: skip
+    return [union(world, submaps, empty) for world in kept], report
+
+
+def find_seams(
+    submaps: Sequence[Submap], mapper_of_part: Callable[[Submap], Mapper], options: MappingOptions
+) -> list[Seam]:
+    """The seams between all submaps that share images, with what speaks against each."""
+    commons = [
+        find_common(a, b, submaps, options)
+        for a in range(len(submaps))
+        for b in range(a + 1, len(submaps))
+        if len(np.intersect1d(submaps[a].registered_idx, submaps[b].registered_idx))
+    ]
+    known = [
+        joint_covariances(submap, mapper_of_part, [common for common in commons if n in common.submaps])
+        for n, submap in enumerate(submaps)
+    ]
+    return [
+        fit_seam(common, submaps, [known[n].get(common.submaps) for n in common.submaps], options) for common in commons
+    ]
+
+
+def _reason_against(world: Assembly, kept: Sequence[Assembly], seams: Sequence[Seam]) -> str:
+    """Why submaps that share images with others have no part in their model; empty where they share none."""
+    others = {n for other in kept for n in other.members}
+    for seam in seams:
+        for inside, outside in (seam.submaps, seam.submaps[::-1]):
+            if inside in world.members and outside in others:
+                return f"submap {outside}: {seam.reason}"
+    return ""
