@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from sfmapp.geometry import rigid3
+from sfmapp.camera.camera import Camera
+from sfmapp.camera.names import CameraModel
+from sfmapp.geometry import epipolar, rigid3
+from sfmapp.geometry.fundamental import fundamental_from_points
+from sfmapp.geometry.relative_pose import refine_relative_pose
+from sfmapp.geometry.turned_views import turn_at_focal
 from sfmapp.mapping.initialize import (
     ENOUGH_ANGLE_DEG,
     InitialPair,
@@ -14,7 +22,9 @@ from sfmapp.mapping.initialize import (
     single_places,
 )
 from sfmapp.mapping.options import MappingOptions
-from sfmapp.scene.correspondences import TwoViewConfig
+from sfmapp.mapping.tracks import build_tracks
+from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
+from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, true_correspondences
 
@@ -93,3 +103,58 @@ def test_the_first_image_is_the_origin_and_the_second_a_unit_away() -> None:
     assert sorted(model.registered_idx) == sorted(pair.image_idx)
     np.testing.assert_array_equal(model.cam_from_world[pair.image_idx[0]], rigid3.IDENTITY)
     assert np.linalg.norm(rigid3.center(model.cam_from_world[pair.image_idx[1]])) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 4, 7])
+def test_a_pose_found_with_a_guessed_focal_length_is_searched_for_anew(seed: int) -> None:
+    # The camera moves aside by a tenth of the distance of what it sees, and turns by five degrees. There is a second
+    # valley in which it turned more and moved ahead, at right angles to the true baseline.
+    rng, focal = np.random.default_rng(seed), 500.0
+    camera = Camera(CameraModel.PINHOLE, 640, 360, np.array([focal, focal, 320.0, 180.0]), focal_source="default")
+    x1 = rng.uniform([-0.6, -0.34], [0.6, 0.34], (300, 2))
+    xyz = np.column_stack([x1, np.ones(300)]) * rng.uniform(3.0, 4.5, (300, 1))
+    turn, center = rigid3.exp_so3(np.array([0.0, 0.08, 0.02])), np.array([0.25, 0.05, 0.0])
+    there = (xyz - center) @ turn.T
+    x2 = there[:, :2] / there[:, 2:]
+    x1, x2 = (x + rng.normal(0.0, 0.3 / focal, x.shape) for x in (x1, x2))
+    truth = rigid3.from_matrix(turn, -turn @ center / np.linalg.norm(center))
+    only_turned = turn_at_focal(x1, x2, 0.1, 0.0)[0]
+    ahead = rigid3.from_matrix(only_turned, -only_turned[:, 2])
+    for _ in range(6):
+        ahead = refine_relative_pose(ahead, x1, x2, 1.0 / focal)
+    assert _between_baselines_deg(ahead, truth) > 60.0  # a valley of its own
+
+    found = _one_pair(camera, x1, x2, ahead)
+    features = [Features.from_arrays(focal * x + [320.0, 180.0]) for x in (x1, x2)]
+    tracks = build_tracks(found, features)[0]
+    empty = Reconstruction.empty([camera], ["a", "b"], np.zeros(2, np.int32), tracks)
+    pose = rank_initial_pairs(empty, found, np.ones(2, bool), MappingOptions())[0].cam2_from_cam1
+    assert _between_baselines_deg(pose, truth) < 3.0
+    # one that was found with a known focal length is not doubted
+    known = Reconstruction.empty([replace(camera, focal_source="user")], ["a", "b"], np.zeros(2, np.int32), tracks)
+    kept = rank_initial_pairs(known, found, np.ones(2, bool), MappingOptions())[0].cam2_from_cam1
+    assert _between_baselines_deg(kept, ahead) < 3.0
+
+
+def _between_baselines_deg(pose: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Whatever their sign, which is that of all depths."""
+    a, b = rigid3.center(pose), rigid3.center(other)
+    return float(np.degrees(np.arccos(min(abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b), 1.0))))
+
+
+def _one_pair(
+    camera: Camera, x1: NDArray[np.float64], x2: NDArray[np.float64], pose: NDArray[np.float64]
+) -> Correspondences:
+    """All of (N, 2) normalised points matched: with few of them off a plane, whose F is not asked, and this pose."""
+    num, back = len(x1), np.linalg.inv(camera.k_matrix)
+    fundamental = back.T @ fundamental_from_points(x1, x2) @ back
+    counts = np.array([num], np.int32)
+    return Correspondences(
+        pair_image_idx=np.array([[0, 1]], np.int32), pair_ptr=np.array([0, num]),
+        matches=np.column_stack([np.arange(num)] * 2).astype(np.int32),
+        config=np.array([TwoViewConfig.PLANAR], np.int8), fundamental=fundamental[None],
+        essential=epipolar.essential_from_pose(pose)[None], homography=np.full((1, 3, 3), np.nan),
+        cam2_from_cam1=pose[None],
+        median_angle_deg=np.array([5.0]), num_putative=counts, num_inliers_f=counts, num_inliers_e=counts,
+        num_inliers_h=np.zeros(1, np.int32),
+    )  # fmt: skip
