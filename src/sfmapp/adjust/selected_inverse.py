@@ -1,11 +1,10 @@
 """Covariances of many images and their cameras: those blocks of the inverse of a sparse system that are wanted.
 
 The reduced system of a survey is sparse, its inverse is full: of a thousand images half a gigabyte, of which the blocks
-on the diagonal are a thousandth. The recursion of Takahashi, Fagan and Chen ("Formation of a sparse bus impedance
-matrix", 1973; Golub and Plemmons, "Large-scale geodetic least-squares adjustment", 1980) makes the entries of the
-inverse where the factor has its own, from the last column to the first, and nothing else. What is open is held by two
-images alone, which keeps the system sparse, and the blocks are then moved to the gauge of inner constraints (an
-S-transformation: Baarda 1973), for which as many columns are solved as there are open directions.
+on the diagonal are a thousandth. Fronts (:mod:`sfmapp.adjust.fronts`) make the entries of the inverse where the factor
+has its own, and nothing else. What is open is held by two images alone, which keeps the system sparse, and the blocks
+are then moved to the gauge of inner constraints (an S-transformation: Baarda 1973), for which as many columns are
+solved as there are open directions.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +25,8 @@ from sfmapp.adjust.covariance import (
     residual_variance,
     upper_tiles,
 )
-from sfmapp.adjust.linear import is_sparse
+from sfmapp.adjust.fronts import FrontFactor, order_of
+from sfmapp.adjust.linear import is_sparse, one_blas_thread
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
@@ -70,7 +69,8 @@ def selected_covariances(
     if engine.extras is not None:
         engine.extras.weight = variance
     engine.linearize(0.0, map)
-    found = _inverse_blocks(engine)
+    with one_blas_thread():
+        found = _inverse_blocks(engine)
     if found is None:
         return None
     (blocks, beside), num_gauge = found
@@ -96,7 +96,7 @@ def covariance_of_functions(engine: Engine, rows: Array) -> Array | None:
         engine.linearize(0.0, map)
         matrix = _sparse_system(engine, used)
         root = 1.0 / np.sqrt(matrix.diagonal())
-        factor = _factored(matrix.multiply(root[:, None]).multiply(root[None]).tocsc())
+        factor = _factored(matrix.multiply(root[:, None]).multiply(root[None]).tocsc(), used)
         if factor is not None:
             found: Array = (wanted * root) @ factor.solve((wanted * root).T)
             return found
@@ -118,18 +118,12 @@ def _inverse_blocks(engine: Engine) -> tuple[Array, int] | None:
         # in the units of the scaled unknowns; two images that are far apart hold what is open
         basis, constraint = basis / root, constraint * root
         scaled = scaled + _held_by_two(engine.problem, used, basis)
-    factor = _factored(scaled.tocsc())
+    factor = _factored(scaled.tocsc(), used)
     if factor is None:
         return None
-    lower, pivots = factor.L.tocsc(), factor.U.diagonal()
-    lower.sort_indices()
-    diagonal, entries = np.empty(len(root)), np.zeros(len(lower.data))
-    _select(lower.indptr.astype(np.int64), lower.indices.astype(np.int64), lower.data, pivots, diagonal, entries)
-    place = np.argsort(factor.perm_c)  # of the columns of the factor among ours
-    if not _agrees(factor, diagonal, place):
+    blocks, diagonal = _gathered(factor, used)
+    if not _agrees(factor, diagonal):
         return None
-    column = np.repeat(np.arange(len(root)), np.diff(lower.indptr))
-    blocks = _gathered(place[lower.indices], place[column], entries, place, diagonal, used)
     if len(basis):
         blocks = _in_inner_gauge(blocks, factor, basis, constraint, used)
     full_root = np.zeros(len(used))
@@ -139,18 +133,17 @@ def _inverse_blocks(engine: Engine) -> tuple[Array, int] | None:
     return blocks * per_block[:, :, None] * np.stack([per_block, behind])[:, :, None, :], len(basis)
 
 
-def _factored(scaled: Any) -> Any:
-    """The factor of a symmetric sparse matrix; None where it is singular, or too full."""
-    from scipy.sparse.linalg import splu
-
-    try:
-        factor = splu(
-            scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
-        )
-    except RuntimeError:  # singular
+def _factored(scaled: Any, used: NDArray[np.bool_]) -> FrontFactor | None:
+    """The factor of a symmetric sparse matrix over the unknowns that are used; None where it is singular, or too
+    full."""
+    _, block_of = np.unique(np.flatnonzero(used) // 8, return_inverse=True)
+    order = order_of(scaled, block_of)
+    if order.num_entries * (len(block_of) / (block_of[-1] + 1)) ** 2 > _MAX_ENTRIES:
         return None
-    is_sound = (factor.U.diagonal() > 0).all() and np.array_equal(factor.perm_r, factor.perm_c)
-    return factor if is_sound and factor.L.nnz <= _MAX_ENTRIES else None
+    try:
+        return FrontFactor(scaled, block_of, order)
+    except np.linalg.LinAlgError:  # singular
+        return None
 
 
 def _held_by_two(problem: Problem, used: NDArray[np.bool_], basis: Array) -> Any:
@@ -171,7 +164,9 @@ def _held_by_two(problem: Problem, used: NDArray[np.bool_], basis: Array) -> Any
     return sparse.coo_matrix(((rows @ rows.T).ravel(), (row.ravel(), column.ravel())), shape=(size, size))
 
 
-def _in_inner_gauge(blocks: Array, factor: Any, basis: Array, constraint: Array, used: NDArray[np.bool_]) -> Array:
+def _in_inner_gauge(
+    blocks: Array, factor: FrontFactor, basis: Array, constraint: Array, used: NDArray[np.bool_]
+) -> Array:
     """Blocks (2, B, 8, 8) of a covariance S with the open directions (k, N) held somehow, moved to where the
     constraints (k, N) vanish: of P S P^T, with P = 1 - basis^T (constraint basis^T)^-1 constraint."""
     crossed = factor.solve(constraint.T)
@@ -202,55 +197,26 @@ def _sparse_system(engine: Engine, used: NDArray[np.bool_]) -> Any:
     return (upper + sparse.triu(upper, 1).T).tocsc()
 
 
-def _gathered(row: Ints, column: Ints, entries: Array, place: Ints, diagonal: Array, used: NDArray[np.bool_]) -> Array:
-    """(2, B, 8, 8) blocks on the diagonal, and each with the one behind it, of entries of the inverse by their
-    unknowns; zeros where the factor has none."""
+def _gathered(factor: FrontFactor, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """(2, B, 8, 8) blocks of the inverse on its diagonal, and each with the one behind it, zeros where the factor has
+    none; and the diagonal (N,)."""
     number = np.flatnonzero(used)
-    num = len(used) // 8
-    blocks = np.zeros((2, num, 8, 8))
-    ends = number[row], number[column]
-    for i, j in (ends, ends[::-1]):
-        for k in range(2):
-            kept = i // 8 + k == j // 8
-            blocks[k, i[kept] // 8, i[kept] % 8, j[kept] % 8] = entries[kept]
-    own = number[place]
-    blocks[0, own // 8, own % 8, own % 8] = diagonal
-    return blocks
+    blocks, diagonal = np.zeros((2, len(used) // 8, 8, 8)), np.empty(len(number))
+    for unknowns, num_own, inverse in factor.inverse():
+        diagonal[unknowns[:num_own]] = inverse.diagonal()[:num_own]
+        row, column = number[unknowns], number[unknowns[:num_own]]
+        apart = column // 8 - row[:, None] // 8
+        for k, turned in ((0, False), (1, False), (1, True)):
+            i, j = np.nonzero(apart == (-k if turned else k))
+            first, second = (column[j], row[i]) if turned else (row[i], column[j])
+            blocks[k, first // 8, first % 8, second % 8] = inverse[i, j]
+    return blocks, diagonal
 
 
-def _agrees(factor: Any, diagonal: Array, place: Ints) -> bool:
+def _agrees(factor: FrontFactor, diagonal: Array) -> bool:
     """Whether some entries are those that the factor itself solves for."""
     chosen = np.linspace(0, len(diagonal) - 1, _NUM_CHECKED).astype(int)
     right = np.zeros((len(diagonal), len(chosen)))
-    right[place[chosen], np.arange(len(chosen))] = 1.0
-    solved = factor.solve(right)[place[chosen], np.arange(len(chosen))]
+    right[chosen, np.arange(len(chosen))] = 1.0
+    solved = factor.solve(right)[chosen, np.arange(len(chosen))]
     return bool(np.allclose(solved, diagonal[chosen], rtol=_MAX_OFF))
-
-
-@numba.njit(cache=True, nogil=True)
-def _select(indptr: Ints, indices: Ints, lower: Array, pivots: Array, diagonal: Array, entries: Array) -> None:
-    """Fill the inverse's diagonal (N,), and its entries (NNZ,) below that where those of the factor L D L^T are; rows
-    are sorted in each column, which begins with its diagonal."""
-    size = len(pivots)
-    place, found = np.full(size, -1), np.zeros(size)
-    for j in range(size - 1, -1, -1):
-        first, end = indptr[j] + 1, indptr[j + 1]
-        for q in range(first, end):
-            place[indices[q]] = q
-            found[q - first] = 0.0
-        for q in range(first, end):
-            k = indices[q]
-            factor = lower[q]
-            total = diagonal[k] * factor
-            for p in range(indptr[k] + 1, indptr[k + 1]):
-                at = place[indices[p]]
-                if at >= 0:
-                    found[at - first] += entries[p] * factor
-                    total += entries[p] * lower[at]
-            found[q - first] += total
-        value = 1.0 / pivots[j]
-        for q in range(first, end):
-            entries[q] = -found[q - first]
-            value += found[q - first] * lower[q]
-            place[indices[q]] = -1
-        diagonal[j] = value
