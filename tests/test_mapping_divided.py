@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,12 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.image_set import ImageRecord, ImageSet
 from sfmapp.mapping import divided, division
 from sfmapp.mapping.assembly import assemble, union
-from sfmapp.mapping.divided import find_seams
+from sfmapp.mapping.divided import PartsWork, find_seams
 from sfmapp.mapping.division import divide, links
 from sfmapp.mapping.incremental import Ends, map_images, map_part
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.part_files import KeptParts
 from sfmapp.mapping.submaps import Part, Submap
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
@@ -187,7 +189,7 @@ def scene() -> SyntheticScene:
     return street_scene()
 
 
-def mapped(scene, executor=None, threads=1):
+def mapped(scene, executor=None, threads=1, kept=None):
     """The models, the report, and what was warned of."""
     warnings: list[str] = []
     events = Events(lambda event: warnings.append(event.message) if event.kind == "warned" else None)
@@ -196,7 +198,7 @@ def mapped(scene, executor=None, threads=1):
     models, report = map_images(
         ImageSet(records, tuple(scene.observed.cameras)), features_of(scene), true_correspondences(scene),
         MappingOptions(), adjust_options=AdjustOptions(), threads=threads, events=events,
-        ends=Ends(executor=executor),
+        ends=Ends(parts=None if executor is None else PartsWork(executor, kept)),
     )  # fmt: skip
     return models, report, warnings
 
@@ -263,6 +265,51 @@ def test_who_is_done_first_and_how_many_threads_there_are_is_in_no_result(scene,
         (model,), _, _ = again
         np.testing.assert_array_equal(model.cam_from_world, expected.cam_from_world)
         np.testing.assert_array_equal(model.point_xyz, expected.point_xyz)
+
+
+class InFiles(Backwards):
+    """Has a folder, as those have whose workers share no memory, and sends all units through bytes."""
+
+    def __init__(self, folder):
+        super().__init__(1)
+        self.folder, self.num_done = folder, 0
+
+    def run(self, work, units, *, bytes_needed=None):
+        for n, answer in super().run(pickle.loads(pickle.dumps(work)), pickle.loads(pickle.dumps(list(units)))):
+            self.num_done += 1
+            yield n, answer
+
+
+def test_parts_in_files_and_such_as_were_kept_come_to_the_same_bytes(scene, in_parts, tmp_path):
+    (expected,), report, _ = in_parts
+    kept = KeptParts(tmp_path / "kept", "this code")
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    first, again, other = (InFiles(shared) for _ in range(3))
+    runs = [mapped(scene, first, kept=kept), mapped(scene, again, kept=kept)]
+    assert first.num_done == len(report.parts.submaps)
+    assert again.num_done == 0
+    stored = sorted(kept.folder.iterdir())
+    assert len(stored) == first.num_done
+    stored[0].write_bytes(b"torn")  # it is made again, the others are not
+    runs.append(mapped(scene, other, kept=kept))
+    assert other.num_done == 1
+    for (model,), _, _ in runs:
+        np.testing.assert_array_equal(model.cam_from_world, expected.cam_from_world)
+        np.testing.assert_array_equal(model.point_xyz, expected.point_xyz)
+    part = submaps_of(scene, range(10))[0][0].part
+    assert KeptParts(kept.folder, "other code").read(part) is None
+
+
+def test_workers_of_dask_map_parts_to_the_same_bytes(scene, in_parts, tmp_path):
+    pytest.importorskip("distributed")
+    from sfmapp.cluster.dask_executor import open_cluster
+
+    (expected,), _, _ = in_parts
+    with open_cluster("local:2", tmp_path, [], Events()) as executor:
+        (model,), _, _ = mapped(scene, executor)
+    np.testing.assert_array_equal(model.cam_from_world, expected.cam_from_world)
+    np.testing.assert_array_equal(model.point_xyz, expected.point_xyz)
 
 
 class Tampering(Threads):

@@ -6,7 +6,7 @@ registered as any others are, and all is adjusted together. No part's failure is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,6 +19,7 @@ from sfmapp.mapping.assembly import Assembly, assemble, union
 from sfmapp.mapping.division import divide
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.part_files import KeptParts, map_stored, read_models, store_part
 from sfmapp.mapping.report import PartsReport, SeamReport, SubmapReport
 from sfmapp.mapping.seams import Seam, find_common, fit_seam, joint_covariances
 from sfmapp.mapping.submaps import Part, Submap
@@ -64,16 +65,24 @@ class Divided:
 
 
 @dataclass(frozen=True)
+class PartsWork:
+    """Who maps the parts of a large set, and where what they come to is kept, None for nowhere."""
+
+    executor: Executor
+    kept: KeptParts | None = None
+
+
+@dataclass(frozen=True)
 class InParts:
     """How a large set is mapped in parts.
 
     Attributes:
-        executor: who maps them.
-        map_part: makes the models of one, the largest first.
+        work: who maps them, and where they are kept.
+        map_part: makes the models of one, the largest first; can be sent to another process.
     """
 
-    executor: Executor
-    map_part: Callable[[Part], list[Reconstruction]]
+    work: PartsWork
+    map_part: Callable[[Events, Part], list[Reconstruction]]
 
     def models(
         self, empty: Reconstruction, correspondences: Correspondences, mapper_of: Callable[[Reconstruction], Mapper]
@@ -99,7 +108,7 @@ class InParts:
         sizes = [len(part.image_idx) for part in parts]
         found: dict[int, list[Reconstruction]] = {}
         events.started(_STEP, f"{len(parts)} parts of {min(sizes)} to {max(sizes)} images", total=len(parts))
-        with closing(self.executor.run(self.map_part, parts)) as answers:
+        with closing(self._answers(parts, events)) as answers:
             for n, models in answers:
                 found[n] = models
                 registered = [int(model.is_registered.sum()) for model in models]
@@ -108,6 +117,34 @@ class InParts:
                 events.advanced(_STEP, message=text)
         events.finished(_STEP)
         return [Submap(part, model) for n, part in enumerate(parts) for model in found[n]]
+
+    def _answers(
+        self, parts: Sequence[Part], events: Events
+    ) -> Generator[tuple[int, list[Reconstruction]], None, None]:
+        """Models of the parts as they come, those first that an earlier run has kept."""
+        kept, executor = self.work.kept, self.work.executor
+        waiting = []
+        for n, part in enumerate(parts):
+            models = kept.read(part) if kept is not None else None
+            if models is None:
+                waiting.append(n)
+            else:
+                yield n, models
+        for k, models in self._made(executor, [parts[n] for n in waiting], events):
+            if kept is not None:
+                kept.write(parts[waiting[k]], models)
+            yield waiting[k], models
+
+    def _made(
+        self, executor: Executor, parts: Sequence[Part], events: Events
+    ) -> Generator[tuple[int, list[Reconstruction]], None, None]:
+        """Models of parts that an executor maps, as they come."""
+        if executor.folder is None:
+            yield from executor.run(partial(self.map_part, events.unheard()), parts)
+            return
+        stored = [store_part(executor.folder, n, part) for n, part in enumerate(parts)]
+        for n, path in executor.run(partial(map_stored, self.map_part), stored):
+            yield n, read_models(path, parts[n])
 
 
 def parts_of(empty: Reconstruction, correspondences: Correspondences) -> list[Part]:

@@ -21,13 +21,12 @@ from sfmapp.camera.camera import Camera
 from sfmapp.contradictions import Contradiction
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.executor import Executor as WorkExecutor
 from sfmapp.executor import Threads
 from sfmapp.images.folder import ImageSet
 from sfmapp.mapping import verified_pairs
 from sfmapp.mapping.carry import carried
 from sfmapp.mapping.closing_move import closing_move, widened_by_move
-from sfmapp.mapping.divided import Divided, InParts
+from sfmapp.mapping.divided import Divided, InParts, PartsWork
 from sfmapp.mapping.focal import estimate_focal_ratio
 from sfmapp.mapping.focal_priors import MapFrom, Mapped, settle_focal_lengths
 from sfmapp.mapping.intrinsics_check import check_intrinsics, widened_uncertainty
@@ -78,13 +77,13 @@ class Ends:
             photographs turn out not to believe a focal length, or which parts are one, it begins anew.
         is_apart: images of one of them come to another with it, by the similarity between them, and not one by one.
         closing: called in the end with the finished models, the largest first, to move and adjust them further.
-        executor: who maps the parts of large sets; None: threads of this process.
+        parts: who maps the parts of large sets, and where these are kept; None: threads of this process, nowhere.
     """
 
     start: Sequence[Reconstruction] = ()
     is_apart: bool = False
     closing: Callable[[list[Mapper]], None] | None = None
-    executor: WorkExecutor | None = None
+    parts: PartsWork | None = None
 
 
 def map_images(
@@ -129,9 +128,7 @@ def map_images(
         )
     events.decided(STAGE, f"{track_report.num_tracks} tracks", **track_report)
     with ThreadPoolExecutor(threads) as pool:
-        by_parts = InParts(
-            ends.executor or Threads(threads), partial(map_part, options, adjust_options, events.unheard())
-        )
+        by_parts = InParts(ends.parts or PartsWork(Threads(threads)), partial(map_part, options, adjust_options))
         task = _Task(names, image_camera_idx, options, adjust_options, events, pool, threads, by_parts)
 
         def map_all(given: list[Camera]) -> Mapped:

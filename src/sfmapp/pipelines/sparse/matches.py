@@ -37,7 +37,7 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
     with (
         kernels_compiling(events, run.usage, modules),
         Store(run.workspace.database, image_set, feature_keys, keys.matching) as store,
-        _executor(run, image_set) as executor,
+        work_executor(run, image_set) as executor,
     ):
         with run.stage("features", keys.features):
             run.features, extracted = extract_features(
@@ -64,8 +64,8 @@ def find_matches(run: Run, image_set: ImageSet, keys: StageKeys, modules: tuple[
 
 
 @contextmanager
-def _executor(run: Run, image_set: ImageSet) -> Iterator[Executor | None]:
-    """The workers of a cluster that find features and matches; None: threads of this process do."""
+def work_executor(run: Run, image_set: ImageSet) -> Iterator[Executor | None]:
+    """The workers of a cluster that do the units of a run; None: threads of this process do."""
     address = run.options.cluster
     if address is None:
         yield None

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from sfmapp.adjust.solver import import_ahead
 from sfmapp.errors import NoReconstructionError, TooFewImagesError, UsageError
 from sfmapp.events import Events
+from sfmapp.executor import Threads
 from sfmapp.formats.colmap import read_model
 from sfmapp.georeference.sources import with_positions
 from sfmapp.images.load import GivenImages, name_of
 from sfmapp.pipelines.sparse import results
 from sfmapp.pipelines.sparse.keys import StageKeys
-from sfmapp.pipelines.sparse.matches import find_matches
+from sfmapp.pipelines.sparse.matches import find_matches, work_executor
 from sfmapp.pipelines.sparse.run import Run
 from sfmapp.pipelines.sparse.videos import load_sources
 from sfmapp.pipelines.sparse.world import closing, has_factors, held_poses, read_world
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 # So many photographs are mapped in seconds, of which loading rerun beside it saves half a one. The child of a larger
 # set would hold a hundred megabytes for nothing.
 _SOON_MAPPED = 200
+# Where the parts of large sets are kept until all is mapped.
+PARTS = "parts"
 
 
 class RunResult(NamedTuple):
@@ -129,8 +132,10 @@ def map_and_report(run: Run, image_set: ImageSet, keys: StageKeys) -> Reconstruc
 
 def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconstruction]:
     """From photographs to models, the largest first."""
+    from sfmapp.mapping.divided import PartsWork
     from sfmapp.mapping.incremental import Ends, map_images
     from sfmapp.mapping.known_poses import map_known_poses
+    from sfmapp.mapping.part_files import KeptParts
 
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
@@ -153,10 +158,15 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
             )
         else:
             start, is_apart = (run.before.models, run.before.is_apart) if run.before is not None else ([], False)
-            models, mapped = map_images(
-                *given, adjust_options=options.adjust, threads=threads, events=events,
-                ends=Ends(start, is_apart, closing(run, image_set)),
-            )  # fmt: skip
+            kept = KeptParts(run.workspace.folder / PARTS, keys.mapping)
+            with work_executor(run, image_set) as executor:
+                models, mapped = map_images(
+                    *given, adjust_options=options.adjust, threads=threads, events=events,
+                    ends=Ends(
+                        start, is_apart, closing(run, image_set), PartsWork(executor or Threads(threads), kept)
+                    ),
+                )  # fmt: skip
+            kept.remove()
         run.stages = replace(run.stages, mapping=mapped)
     if run.judge is not None:
         run.judge(models)
