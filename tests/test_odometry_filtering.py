@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -312,13 +313,19 @@ def test_the_mounting_counts() -> None:
 # ---- errors that neighbouring frames share
 
 
-def drifting(case: Case, seed: int, shared: Shared) -> np.ndarray:
+def drifting(
+    case: Case, seed: int, shared: Shared, adjusted: Sequence[int] = ()
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """Poses whose errors are partly new in each frame, and partly walk on with the map: a place that was seen with an
     error stays where it was put. What walks has a rate that lasts for 2 / walk frames, and goes by half of what a pose
-    is less sure than the one before it as well."""
+    is less sure than the one before it as well.
+
+    Before the frames that are named an adjustment takes all of it back: a place x of the map was at moved[frame](x).
+    """
     rng = np.random.default_rng([seed, 77])
     measured, kept = read_measured(case.times, case.truth, case.covariance), 1.0 - 0.5 * shared.walk
     poses, turn, shift, rate, last = [], np.eye(3), np.zeros(3), np.zeros(6), np.zeros((6, 6))
+    moved = {}
     for k, (center, rotation, noise) in enumerate(
         zip(measured.position, measured.rotation, measured.noise, strict=True)
     ):
@@ -337,20 +344,25 @@ def drifting(case: Case, seed: int, shared: Shared) -> np.ndarray:
         else:
             rate = shared.walk * new_rate
         last = now
+        if k in adjusted:
+            moved[k], turn, shift = similarity.from_parts(turn, shift, 1.0), np.eye(3), np.zeros(3)
         poses.append(rigid3.inverse(rigid3.from_matrix(turn @ rotation, turn @ center + shift)))
     white = np.sqrt(shared.white) * np.linalg.cholesky(case.covariance)
-    return perturbed(np.array(poses), np.einsum("nij,nj->ni", white, rng.normal(size=(len(poses), 6))))
+    return perturbed(np.array(poses), np.einsum("nij,nj->ni", white, rng.normal(size=(len(poses), 6)))), moved
 
 
-def with_shared(case: Case, poses: np.ndarray, shared: Shared) -> tuple[FilteredTrajectory, np.ndarray]:
+def with_shared(
+    case: Case, poses: np.ndarray, shared: Shared, moved: dict[int, np.ndarray] | None = None
+) -> tuple[FilteredTrajectory, np.ndarray]:
     """The filter told how errors are shared, and errors beyond those at its first row, 6 in the mean each."""
+    moved = moved or {}
     measured = read_measured(case.times, poses, case.covariance)
     found, imu, n = InertialFilter(case.sensor, 10.0), case.sensor.imu, 0
     for f, frame_s in enumerate(case.times):
         while imu.timestamps_s[n] <= frame_s:
             found.add_sample(float(imu.timestamps_s[n]), imu.gyro[n], imu.accel[n])
             n += 1
-        found.add_frame(float(frame_s), measured.pose(f), shared)
+        found.add_frame(float(frame_s), measured.pose(f), shared, moved.get(f, similarity.IDENTITY))
     result = found.result()
     return result, case.nees(result, result.frame_row[40::40])
 
@@ -359,7 +371,7 @@ def test_errors_that_walk_with_the_map_are_told_from_noise() -> None:
     shared = Shared(0.1, 0.2)
     told, nees, naive = [], [], []
     for seed, case in enumerate(CASES):
-        poses = drifting(case, seed, shared)
+        poses, _ = drifting(case, seed, shared)
         found, errors = with_shared(case, poses, shared)
         told.append(found.nis[3:])
         nees.append(errors)
@@ -371,6 +383,22 @@ def test_errors_that_walk_with_the_map_are_told_from_noise() -> None:
     assert low < total.mean() / 6 < high
     # taken for noise that is new in every frame, they promise far too much
     assert np.mean(naive) / 6 > 5.0
+
+
+def test_what_adjustments_take_back_of_the_drift_is_taken_back_in_the_world() -> None:
+    """Where the map is put right every half second the camera is where the map says; what is stated of it allows for
+    adjustments that leave most of the drift. Poses that nothing is taken back of go astray."""
+    shared, adjusted = Shared(0.1, 0.2), range(10, 240, 10)
+    right, astray, errors = [], [], []
+    for seed, case in enumerate(CASES):
+        for frames, away in (((), astray), (adjusted, right)):
+            poses, moved = drifting(case, seed, shared, frames)
+            found, nees = with_shared(case, poses, shared, moved)
+            rows = found.frame_row[120:]
+            away.append((tangent(found.cam_from_world[rows], case.truth[120:]) ** 2).mean(0))
+        errors.append(nees)
+    assert (np.sqrt(np.mean(right, 0) / np.mean(astray, 0)) < 0.7).all()
+    assert 0.2 < np.mean(np.concatenate(errors)) / 6 < 1.0
 
 
 def test_a_map_that_is_adjusted_is_no_motion() -> None:

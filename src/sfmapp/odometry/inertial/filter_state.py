@@ -14,8 +14,11 @@ map began to turn, would seem to be told by slopes that are taken here and there
 length, by a first velocity that was zero and is not. Filters centred on the robot do the same (Castellanos, Martinez-
 Cantin, Tardos and Neira, "Robocentric map joining", Robotics and Autonomous Systems 2007).
 
-The error state (31,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, and the
-rate of the drift.
+What an adjustment of the map takes back of the drift says which part of it was drift, and not the sensor's biases; what
+it takes back is told in the world as well, or the filter would carry it along for good.
+
+The error state (37,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, the
+rate of the drift, and what adjustments have not taken back of it.
 """
 
 from __future__ import annotations
@@ -38,8 +41,8 @@ Array = NDArray[np.float64]
 
 # Where the parts of the error state are.
 _P, _R, _V, _BG, _BA, _G, _CP, _CR = (slice(3 * k, 3 * k + 3) for k in range(8))
-_S, _U = slice(24, 25), slice(25, 31)
-_SIZE = 31
+_S, _U, _W = slice(24, 25), slice(25, 31), slice(31, 37)
+_SIZE = 37
 _ROWS = np.arange(_SIZE)
 # Gravity is 9.78 to 9.83 m/s^2 from place to place.
 _GRAVITY_SIGMA = 0.02
@@ -51,6 +54,13 @@ _LEAST_PARALLAX = math.radians(1.0)
 # to 1.2 without (but for one whose first map was wrong) and 0.6 to 1.0 with all of it; those beside them are the less
 # correlated the more there is of it.
 _STEPS = 0.5
+# What an adjustment takes back of the variance of the drift, at most: successive ones take back the same thing in part.
+# By six rendered flights (20, 21, 22, 26, 103, 108), on which errors are 0.4 to 1.3 of their covariances with it and up
+# to three times that with 0.4. Below a thousandth it tells nothing.
+_MOST_TAKEN, _LEAST_TAKEN = 0.15, 1e-3
+# Where more is taken back than can have drifted of late, chi-squared of six beyond what one in a million is, it is of a
+# loop or of a wrong first map, and counts the less the more it is.
+_MOST_SQUARES = 38.3
 
 
 @dataclass(frozen=True)
@@ -109,6 +119,9 @@ class FilterState:
         self._shift, self._turn, self._log_scale = np.zeros(3), np.eye(3), 0.0
         self._is_metric = sensor.scale_sigma == 0.0
         self._rate = np.zeros(6)  # of the drift, a frame: of what is where the camera is, and of the rotation
+        # the drift that no adjustment took back, where the camera was; covariance of it and of the rate by poses alone
+        self._walked, self._there, self._by_poses = np.zeros(6), np.zeros(3), np.zeros((12, 12))
+        self._num_taken, self._share_taken = 0, 0.0
         self._last_noise: Array | None = None  # (6, 6) of the last pose, in the axes of the map
         self._behind = np.zeros(3)  # in the map, where the camera was when the points that it sees were new
         self._p = np.zeros((_SIZE, _SIZE))
@@ -161,7 +174,9 @@ class FilterState:
         in_map = np.eye(6)
         in_map[3:, 3:] = rotation
         self._last_noise = in_map @ noise @ in_map.T
-        self._p[_U, _U] = shared.walk**2 * self._last_noise
+        self._there, self._walked, self._by_poses = center, np.zeros(6), np.zeros((12, 12))
+        self._by_poses[:6, :6], self._by_poses[6:, 6:] = self._last_noise, shared.walk**2 * self._last_noise
+        self._p[_U, _U], self._p[_W, _W] = self._by_poses[6:, 6:], self._by_poses[:6, :6]
         self._p[_V, _V] = self._speed**2 * np.eye(3)
         self.take_map_for_world()
 
@@ -175,8 +190,11 @@ class FilterState:
         self._p = change @ self._p @ change.T
 
     def move_map(self, moved: Array) -> None:
-        """The map was put elsewhere: a place x of it was at moved(x), a similarity (8,). The camera stays."""
+        """The map was put elsewhere: a place x of it was at moved(x), a similarity (8,). The camera stays, but for what
+        that tells of where it was."""
         back = similarity.inverse(moved)
+        if not np.array_equal(moved, similarity.IDENTITY):
+            self._take_back(self._there - similarity.apply(back, self._there), rigid3.rotation_matrix(moved))
         turn, size = rigid3.rotation_matrix(back), float(back[7])
         self._position, self._shift = similarity.apply(back, self._position), similarity.apply(back, self._shift)
         self._behind = similarity.apply(back, self._behind)
@@ -184,14 +202,40 @@ class FilterState:
         self._velocity, self._gravity = size * turn @ self._velocity, turn @ self._gravity
         self._log_scale += math.log(size)
         rate = np.kron(np.diag([size, 1.0]), turn)
-        self._rate = rate @ self._rate
+        self._rate, self._walked = rate @ self._rate, rate @ self._walked
+        self._there, both = similarity.apply(back, self._there), np.kron(np.eye(2), rate)
+        self._by_poses = both @ self._by_poses @ both.T
         if self._last_noise is not None:
             self._last_noise = rate @ self._last_noise @ rate.T
         change = np.eye(_SIZE)
         change[_P, _P] = change[_V, _V] = change[_CP, _CP] = size * turn
         change[_G, _G] = change[_CR, _CR] = turn
-        change[_U, _U] = rate
+        change[_U, _U] = change[_W, _W] = rate
         self._p = change @ self._p @ change.T
+
+    def _take_back(self, shift: Array, turn: Array) -> None:
+        """An adjustment has found that the map had drifted, by a shift (3,) where the camera is and a turn (3, 3).
+
+        It is held to more of the images than the poses were: what it leaves has nothing to do with what it takes back
+        (Hausman, as in :meth:`drift`). Of a drift of covariance S it takes back d, of covariance share S, and leaves
+        (1 - share) S. A measurement d / share with noise (1 / share - 1) S would say the same, and as one it is told to
+        what the sensor has found out about the drift besides. How large the share is, d itself tells.
+        """
+        taken = np.concatenate([shift, rigid3.log_so3(turn)])
+        covariance = self._by_poses[:6, :6]
+        squares = float(taken @ np.linalg.solve(covariance, taken))
+        self._num_taken, self._share_taken = self._num_taken + 1, self._share_taken + min(squares / 6.0, 1.0)
+        share = min(_MOST_TAKEN, self._share_taken / self._num_taken)
+        if share > _LEAST_TAKEN:
+            h = np.zeros((6, _SIZE))
+            h[:, _W] = np.eye(6)
+            noise, innovation = (1.0 / share - 1.0) * covariance, taken / share - self._walked
+            expected = self._p[_W, _W] + noise
+            self._update(innovation, h, noise + (max(1.0, squares / _MOST_SQUARES) - 1.0) * expected)
+            self._by_poses = self._by_poses - share * self._by_poses[:, :6] @ np.linalg.solve(
+                covariance, self._by_poses[:6]
+            )
+        self._walked = self._walked - taken
 
     def drift(self, shared: Shared, noise: Array, center: Array) -> None:
         """The map errs otherwise than at the last frame; what was mapped before stays as it was.
@@ -219,8 +263,17 @@ class FilterState:
         step, kept = np.eye(_SIZE), max(0.0, 1.0 - 0.5 * shared.walk)
         step[:, _U] = spread
         step[_U, _U] = kept * np.eye(6)
+        farther = np.eye(6)
+        farther[:3, 3:] = -rigid3.skew(here - self._there)
+        step[_W, _W], self._there = farther, here
         self._p = step @ self._p @ step.T + spread @ walked @ spread.T
-        self._p[_U, _U] += (1.0 - kept**2) * shared.walk**2 * noise
+        both = np.r_[_W, _U]
+        step, added = step[np.ix_(both, both)], (1.0 - kept**2) * shared.walk**2 * noise
+        self._by_poses = step @ self._by_poses @ step.T
+        self._by_poses[:6, :6] += walked
+        self._p[_U, _U] += added
+        self._by_poses[6:, 6:] += added
+        self._walked = farther @ self._walked + self._rate
         self._position = here + self._rate[:3] + turning @ (self._position - here)
         self._shift = here + self._rate[:3] + turning @ (self._shift - here)
         self._rotation, self._turn = turning @ self._rotation, turning @ self._turn
@@ -229,11 +282,12 @@ class FilterState:
         self._change_unit(shared, noise, center)
 
     def _moved_with_map(self) -> Array:
-        """(31, 6) slopes of the state by the map: how far it moves where the camera is, and how it turns about that."""
+        """(37, 6) slopes of the state by the map: how far it moves where the camera is, and how it turns about that."""
         here, spread = self._center(), np.zeros((_SIZE, 6))
         spread[_P, :3] = spread[_CP, :3] = np.eye(3)
         spread[_P, 3:], spread[_CP, 3:] = -rigid3.skew(self._position - here), -rigid3.skew(self._shift - here)
         spread[_R, 3:], spread[_CR, 3:] = self._rotation.T, np.eye(3)
+        spread[_W] = np.eye(6)
         spread[_V, 3:], spread[_G, 3:] = -rigid3.skew(self._velocity), -rigid3.skew(self._gravity)
         return spread
 
@@ -304,7 +358,7 @@ class FilterState:
         return center
 
     def _measurement(self) -> Array:
-        """(6, 31) slopes of the camera's centre in the map and of its rotation, in its own frame."""
+        """(6, 37) slopes of the camera's centre in the map and of its rotation, in its own frame."""
         h, size = np.zeros((6, _SIZE)), math.exp(self._log_scale)
         h[:3, _P], h[:3, _R] = np.eye(3), -size * self._rotation @ rigid3.skew(self._arm)
         h[:3, 24] = size * self._rotation @ self._arm
@@ -336,7 +390,10 @@ class FilterState:
 
     def correct(self, innovation: Array, noise: Array) -> None:
         """Kalman's update, the covariance in Joseph's form."""
-        h = self._measurement()
+        self._update(innovation, self._measurement(), noise)
+
+    def _update(self, innovation: Array, h: Array, noise: Array) -> None:
+        """By a measurement of slopes h (6, 37)."""
         gain = np.linalg.solve(h @ self._p @ h.T + noise, h @ self._p).T
         step, keep = gain @ innovation, np.eye(_SIZE) - gain @ h
         self._p = keep @ self._p @ keep.T + gain @ noise @ gain.T
@@ -348,13 +405,15 @@ class FilterState:
         turn = rigid3.exp_so3(step[_CR])
         self._turn, self._shift = turn @ self._turn, self._shift + step[_CP]
         self._log_scale, self._rate = self._log_scale + float(step[24]), self._rate + step[_U]
+        self._walked = self._walked + step[_W]
 
     def forget(self, innovation: Array) -> None:
         """The poses jumped, and go on from there: the map did. What carries a camera moves steadily between the samples
         of its sensor, and the world stays where that expects it."""
         squares = [(innovation[:3] ** 2).sum(), (innovation[3:] ** 2).sum()]
-        spread = self._moved_with_map()
-        self._p += (spread * np.repeat(squares, 3)) @ spread.T
+        spread, jumped = self._moved_with_map(), np.repeat(squares, 3)
+        self._p += (spread * jumped) @ spread.T
+        self._by_poses[:6, :6] += np.diag(jumped)
 
     def doubt(self) -> None:
         """What is believed of the sensor, of gravity and of the unit of length is no surer than before the first pose.
