@@ -20,7 +20,7 @@ def measure_cases(
     """Measure cases, all or those on the command line, and write results/NAME.json and .md after each.
 
     Args:
-        measured: the rows of a case, each with its name as "case".
+        measured: the rows of a case, each with its name as "case"; the commit that they were measured at is added.
         markdown: the text of a report with "rows" in the order of the cases.
     """
     cases = list(cases)
@@ -29,13 +29,17 @@ def measure_cases(
     parser.add_argument("--only", nargs="+", metavar="CASE", choices=cases,
                         help="measure these, and keep what is there of the others")  # fmt: skip
     args = parser.parse_args()
-    told = json.loads(args.output.read_text())["rows"] if args.only and args.output.is_file() else []
+    told: list[Row] = []
+    if args.only and args.output.is_file():
+        before = json.loads(args.output.read_text())
+        told = [{"commit": before["commit"]} | row for row in before["rows"]]
+    machine = describe_machine()
     rows = {case: [row for row in told if row["case"] == case] for case in cases}
     for case in args.only or cases:
         rows[case] = []
         for row in measured(case):
-            rows[case].append(row)
+            rows[case].append({"commit": machine["commit"]} | row)
             print(json.dumps(row), flush=True)
-        report = describe_machine() | {"rows": [row for each in rows.values() for row in each]}
+        report = machine | {"rows": [row for each in rows.values() for row in each]}
         args.output.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         args.output.with_suffix(".md").write_text(markdown(report), encoding="utf-8")

@@ -31,6 +31,7 @@ from sfmapp.camera.names import CameraModel
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.odometry.options import OdometryOptions
+from sfmapp.odometry.result import OdometryResult
 from sfmapp.odometry.run import run_odometry
 from sfmapp.odometry.snapshot import MapSnapshot
 from sfmapp.scene.rig import Rig
@@ -72,14 +73,22 @@ def play(rendered: RenderedSequence, loops: bool) -> dict[str, Any]:
     )
     cpu = time.process_time() - begin
     inside = (result.frame_map == 0) & np.isfinite(result.cam_from_world[:, 0])
-    truth, poses = rendered.cam_from_world[inside], result.cam_from_world[inside]
-    moved = similarity.apply(similarity.align_poses(poses, truth).b_from_a, rigid3.center(poses))
+    fitted, _ = errors_of(result, rendered.cam_from_world, inside)
     right = sum(m < MAX_OFF_M and deg < MAX_OFF_DEG for m, deg in offs)
     return {
-        "ate_m": float(np.sqrt(((moved - rigid3.center(truth)) ** 2).sum(1).mean())), "num_frames": len(rendered),
+        "ate_m": float(np.sqrt((fitted[inside] ** 2).mean())), "num_frames": len(rendered),
         "num_with_pose": int(inside.sum()), "num_right": right, "num_wrong": len(offs) - right, "offs": offs,
         "cpu_s": cpu,
     }  # fmt: skip
+
+
+def errors_of(result: OdometryResult, truth: Array, fitted: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """(N,) metres and degrees by which frames are off once some of them are laid onto the truth."""
+    moved = similarity.transform_poses(
+        similarity.align_poses(result.cam_from_world[fitted], truth[fitted]).b_from_a, result.cam_from_world
+    )
+    turn = rigid3.rotation_matrix(moved) @ np.swapaxes(rigid3.rotation_matrix(truth), 1, 2)
+    return np.linalg.norm(rigid3.center(moved) - rigid3.center(truth), axis=1), rigid3.rotation_angle_deg(turn)
 
 
 def off(snapshot: MapSnapshot, old_frame_idx: int, truth: Array) -> tuple[float, float]:
