@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import FrozenInstanceError, replace
+import pickle
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import FrozenInstanceError, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -51,8 +52,30 @@ def test_a_report_reads_as_a_mapping_and_cannot_be_changed() -> None:
         report["get"]
     with pytest.raises(FrozenInstanceError):
         report.length = 1.0  # type: ignore[misc]
-    with pytest.raises(TypeError):
-        Row(1, {})  # type: ignore[misc]
+    with pytest.raises(FrozenInstanceError):
+        del report.light
+    assert repr(Other(reason="why")) == "Other(reason='why')"
+
+
+class Placed(Report, kw_only=False):
+    where: str
+    tags: list[str] = field(default_factory=list)
+
+
+def test_a_report_is_made_of_all_its_fields_and_of_no_others() -> None:
+    assert Placed("here") == Placed(where="here") == {"where": "here", "tags": []}
+    assert Placed("here").tags is not Placed("here").tags
+    assert pickle.loads(pickle.dumps(Placed("here", ["x"]))) == Placed("here", ["x"])
+    wrong: list[tuple[str, Callable[[], object]]] = [
+        ("by name", lambda: Row(1, {})),  # type: ignore[misc]
+        ("'evidence' is missing", lambda: Row(count=1)),  # type: ignore[call-arg]
+        ("'nought' is not one", lambda: Row(count=1, evidence={}, nought=0)),  # type: ignore[call-arg]
+        ("each field once", lambda: Placed("here", where="there")),  # type: ignore[misc]
+        ("each field once", lambda: Placed("here", [], "more")),  # type: ignore[call-arg]
+    ]
+    for message, make in wrong:
+        with pytest.raises(TypeError, match=message):
+            make()
 
 
 @pytest.mark.parametrize("end", [None, Row(count=2, evidence={}), Other(reason="why")])

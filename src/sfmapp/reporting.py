@@ -16,14 +16,13 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, TypeAlias, TypeVar, Union, dataclass_transform
+from typing import Any, ClassVar, TypeAlias, TypeVar, Union, dataclass_transform
 
 Plain: TypeAlias = "bool | int | float | str | Sequence[Plain] | Mapping[str, Plain] | None"
 """What JSON holds."""
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(field,))
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Report(Mapping[str, Any]):
     """Base of all reports: a subclass is a frozen dataclass, its arguments given by name (unless ``kw_only=False``).
 
@@ -33,8 +32,41 @@ class Report(Mapping[str, Any]):
     where it is None.
     """
 
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+    __match_args__: ClassVar[tuple[str, ...]]
+
     def __init_subclass__(cls, *, kw_only: bool = True) -> None:
-        dataclass(frozen=True, eq=False, kw_only=kw_only)(cls)
+        # Methods that a dataclass has written and compiled for it are those below, which all share: a run loads 180
+        # reports, and that was an eighth of what it loads.
+        dataclass(init=False, repr=False, eq=False, kw_only=kw_only)(cls)
+
+    def __init__(self, *given: Any, **values: Any) -> None:
+        names = self.__match_args__[: len(given)]
+        if len(given) > len(names) or values.keys() & names:
+            raise TypeError(f"{type(self).__name__}: expected each field once, and by name where it has to be")
+        values.update(zip(names, given, strict=True))
+        for name, known in self.__dataclass_fields__.items():
+            if name in values:
+                self.__dict__[name] = values.pop(name)
+            elif known.default is not dataclasses.MISSING:
+                self.__dict__[name] = known.default
+            elif known.default_factory is not dataclasses.MISSING:
+                self.__dict__[name] = known.default_factory()
+            else:
+                raise TypeError(f"{type(self).__name__}: {name!r} is missing")
+        if values:
+            raise TypeError(f"{type(self).__name__}: {min(values)!r} is not one of its fields")
+
+    if not typing.TYPE_CHECKING:  # to which reports are frozen anyway
+
+        def __setattr__(self, name: str, value: object) -> None:
+            raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+
+        def __delattr__(self, name: str) -> None:
+            raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.__dict__.items())})"
 
     def __getitem__(self, name: str) -> Any:
         known = self.__dataclass_fields__.get(name)

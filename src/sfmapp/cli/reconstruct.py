@@ -223,11 +223,13 @@ def _demo(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, images: str | list[str], options: Options) -> ReconstructionReport:
     load_numba_sparingly()
-    from sfmapp.pipelines.sparse.add import add_photographs
-    from sfmapp.pipelines.sparse.reconstruct import reconstruct
     from sfmapp.workspace.usage import Stopwatch
 
-    watch, run = Stopwatch(whole_process=True), add_photographs if getattr(args, "add", False) else reconstruct
+    if getattr(args, "add", False):
+        from sfmapp.pipelines.sparse.add import add_photographs as run
+    else:
+        from sfmapp.pipelines.sparse.reconstruct import reconstruct as run
+    watch = Stopwatch(whole_process=True)
     with listening(args) as events:
         result = run(images, args.output, options, events=events, record=not args.no_recording, watch=watch)
     return result.report

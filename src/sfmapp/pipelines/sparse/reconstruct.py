@@ -132,16 +132,17 @@ def map_and_report(run: Run, image_set: ImageSet, keys: StageKeys) -> Reconstruc
 
 def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconstruction]:
     """From photographs to models, the largest first."""
-    from sfmapp.mapping.divided import PartsWork
-    from sfmapp.mapping.incremental import Ends, map_images
-    from sfmapp.mapping.known_poses import map_known_poses
-    from sfmapp.mapping.part_files import KeptParts
-
     options, events, threads = run.options, run.events, run.threads
     if len(image_set.images) < 2:
         raise _too_few_photographs(image_set)
     import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     correspondences = find_matches(run, image_set, keys)
+    # loaded by now, beside the features, with the kernels
+    from sfmapp.mapping.divided import PartsWork
+    from sfmapp.mapping.incremental import Ends, map_images
+    from sfmapp.mapping.known_poses import map_known_poses
+    from sfmapp.mapping.part_files import KeptParts
+
     if run.recorder is not None and run.drawer is not None and len(image_set.images) <= _SOON_MAPPED:
         run.drawer.get_ready()  # what goes wrong is told when it is to draw
     # all that follows knows pictures by keypoints and matches; descriptors are in the database
