@@ -12,7 +12,11 @@ import pytest
 
 from sfmapp import packages
 from sfmapp.cli.main import main
+from sfmapp.dense.scene import DenseScene
 from sfmapp.packages import MissingPackageError, missing_package, require
+from sfmapp.scene.mesh import Mesh
+from sfmapp.surface.options import SurfaceOptions
+from sfmapp.surface.texture import texture_mesh
 
 RARE = ("av", "gtsam", "libusb_package", "mcap", "open3d", "pycolmap", "rerun", "rosbags", "xatlas")
 
@@ -84,15 +88,20 @@ def test_a_run_without_rerun_goes_on_without_a_recording(without: str, tmp_path:
 
 
 @pytest.mark.parametrize("without", ["open3d"], indirect=True)
-def test_a_mesh_without_open3d(without: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mesh_needs_no_open3d_and_its_texture_names_it(without: str, tmp_path: Path) -> None:
     xyz = np.random.default_rng(0).normal(size=(200, 3))
     xyz /= np.linalg.norm(xyz, axis=1, keepdims=True)
     rows = "\n".join(" ".join(f"{v:.6f}" for v in (*p, *p)) for p in xyz)
     head = "\n".join(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz"))
     cloud = tmp_path / "ball.ply"
     cloud.write_text(f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{head}\nend_header\n{rows}\n")
-    assert main(["mesh", str(cloud), "-o", str(tmp_path / "mesh")]) == 3
-    assert "pip install 'open3d-cpu" in capfd.readouterr().err
+    assert main(["mesh", str(cloud), "-o", str(tmp_path / "mesh")]) == 0
+    assert (tmp_path / "mesh" / "mesh" / "mesh.ply").is_file()
+    corners = np.eye(3)
+    mesh = Mesh(corners, np.array([[0, 1, 2]], np.int32), corners.astype(np.float32), np.zeros((3, 3), np.uint8))
+    nowhere = DenseScene((), np.zeros((0, 0), np.int32), np.zeros((0, 3)), np.zeros(1, np.int64), np.zeros(0, np.int32))
+    with pytest.raises(MissingPackageError, match="open3d"):
+        texture_mesh(mesh, nowhere, SurfaceOptions(texture=True))
 
 
 @pytest.mark.parametrize(("without", "name"), [("rosbags", "drive.bag"), ("mcap", "drive.mcap")], indirect=["without"])

@@ -153,7 +153,7 @@ def test_what_is_loaded_is_in_the_key(stage: str) -> None:
         ("mapping.register", {"mapping"}),
         ("adjust.problem", {"mapping", "dense", "mesh", "undistort"}),  # a calibration given to these adjusts poses
         ("dense.growth", {"dense"}),
-        ("surface.poisson_child", {"mesh"}),
+        ("surface.poisson", {"mesh"}),
         ("report.html", set()),
         ("workspace.job", set()),
         ("odometry.run", set()),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.camera import lens
-from sfmapp.carve.octree import gather_bits
+from sfmapp.geometry.morton import gather_bits
 
 Array = NDArray[np.float64]
 Codes = NDArray[np.uint64]

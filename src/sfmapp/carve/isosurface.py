@@ -16,8 +16,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.carve.octree import Codes, Octree, codes_of, gather_bits, places_of
+from sfmapp.carve.octree import Codes, Octree, codes_of, places_of
 from sfmapp.events import Events
+from sfmapp.geometry.cube_cases import EDGES, cube_faces, surface_loops
+from sfmapp.geometry.morton import gather_bits
 from sfmapp.scene.mesh import Mesh, vertex_normals
 
 Array = NDArray[np.float64]
@@ -31,8 +33,6 @@ Normals = Callable[[Array], NDArray[np.float32]]
 STAGE = "surface"
 # where nothing tells a colour
 GREY = 200
-# Corner k of a cell is off by the bits of k along x, y and z. An edge is its first corner and its axis.
-_EDGES = [(corner, axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1]
 # vertices are kept this far from the ends of their edges, as a share of these: triangles have an area, and no vertex
 # is farther off than a fiftieth of a cell
 _APART = 0.02
@@ -312,61 +312,16 @@ class Table(NamedTuple):
 def _table() -> Table:
     first, triangles = [0], []
     for case in range(256):
-        for loop in _loops(case):
+        for loop in surface_loops(case):
             triangles += _cut_loop(loop)
         first.append(len(triangles))
-    return Table(np.array(first, np.int32), np.array(triangles, np.int8).reshape(-1, 3), np.array(_EDGES, np.int8))
-
-
-def _edge_between(a: int, b: int) -> int:
-    axis = (a ^ b).bit_length() - 1
-    return _EDGES.index((min(a, b), axis))
-
-
-@cache
-def _faces() -> list[list[int]]:
-    """The corners of the six faces, anticlockwise as seen from outside the cell."""
-    faces = []
-    for axis in range(3):
-        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
-        faces.append([(1 << axis) + k for k in (0, u, u + v, v)])
-        faces.append([0, v, u + v, u])
-    return faces
-
-
-def _loops(case: int) -> list[list[int]]:
-    """Closed walks over edges that bound the surface in a cell, anticlockwise as seen from outside of the solid.
-
-    On a face, seen from outside the cell, each run of corners inside is cut off by a line from the edge behind it to
-    the one before it, which leaves the solid to its right in the cell's own boundary and so to the left of none.
-    """
-    following = {}
-    for face in _faces():
-        inside = [bool(case >> corner & 1) for corner in face]
-        for k in range(4):
-            if inside[k] and not inside[k - 1]:
-                end = k
-                while inside[(end + 1) % 4]:
-                    end += 1
-                enters = _edge_between(face[k - 1], face[k])
-                leaves = _edge_between(face[end % 4], face[(end + 1) % 4])
-                following[enters] = leaves
-    loops = []
-    while following:
-        start, at = next(iter(following.items()))
-        loop = [start]
-        del following[start]
-        while at != start:
-            loop.append(at)
-            at = following.pop(at)
-        loops.append(loop)
-    return loops
+    return Table(np.array(first, np.int32), np.array(triangles, np.int8).reshape(-1, 3), np.array(EDGES, np.int8))
 
 
 def _share_face(a: int, b: int) -> bool:
     """Whether two edges lie in one face of the cell."""
-    ends = [{corner, corner | 1 << axis} for corner, axis in (_EDGES[a], _EDGES[b])]
-    return any(ends[0] | ends[1] <= set(face) for face in _faces())
+    ends = [{corner, corner | 1 << axis} for corner, axis in (EDGES[a], EDGES[b])]
+    return any(ends[0] | ends[1] <= set(face) for face in cube_faces())
 
 
 def _cut_loop(loop: list[int]) -> list[tuple[int, int, int]]:

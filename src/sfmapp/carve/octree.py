@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.geometry.morton import gather_bits, spread_bits
+
 Array = NDArray[np.float64]
 Codes = NDArray[np.uint64]
 
@@ -57,28 +59,6 @@ class Octree:
         """(N, 3) world places of the middles of cells of a level, by default the finest."""
         level = self.depth if level is None else level
         return np.asarray(self.low + (places_of(codes) + 0.5) * (self.side / 2.0**level))
-
-
-@numba.njit(cache=True, nogil=True)
-def spread_bits(v: np.uint64) -> np.uint64:
-    """The lowest 21 bits of a number with two zeros between each and the next."""
-    v = np.uint64(v) & np.uint64(0x1FFFFF)
-    v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
-    v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
-    v = (v | (v << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
-    v = (v | (v << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
-    return (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
-
-
-@numba.njit(cache=True, nogil=True)
-def gather_bits(v: np.uint64) -> np.uint64:
-    """Every third bit of a number, the inverse of :func:`spread_bits`."""
-    v = np.uint64(v) & np.uint64(0x1249249249249249)
-    v = (v ^ (v >> np.uint64(2))) & np.uint64(0x10C30C30C30C30C3)
-    v = (v ^ (v >> np.uint64(4))) & np.uint64(0x100F00F00F00F00F)
-    v = (v ^ (v >> np.uint64(8))) & np.uint64(0x1F0000FF0000FF)
-    v = (v ^ (v >> np.uint64(16))) & np.uint64(0x1F00000000FFFF)
-    return (v ^ (v >> np.uint64(32))) & np.uint64(0x1FFFFF)
 
 
 @numba.njit(cache=True, nogil=True)

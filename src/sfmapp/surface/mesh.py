@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfmapp.dense.scene import DenseScene
 from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
-from sfmapp.reporting import Step, Usage
+from sfmapp.reporting import Step
 from sfmapp.scene.mesh import Mesh, vertex_normals
 from sfmapp.surface.gaps import close_gaps
 from sfmapp.surface.options import SurfaceOptions
@@ -49,7 +49,7 @@ def make_mesh(
         The mesh, and the report.
 
     Raises:
-        NoReconstructionError: too few patches, Poisson failed in its process, or nothing is left after trimming.
+        NoReconstructionError: too few patches, no surface, or nothing is left of it after trimming.
         InterruptedRunError: ``events`` was asked to stop.
     """
     events = events or Events()
@@ -74,13 +74,9 @@ def make_mesh(
         num_faces=len(mesh.faces),
         num_rim_edges=len(rim(mesh.faces)),
         funnel=funnel,
-        poisson=Usage(
-            wall_s=round(surface.usage.wall_s, 3),
-            cpu_s=round(surface.usage.cpu_s, 3),
-            peak_memory_mb=round(surface.usage.peak_memory_mb, 1),
-        ),
+        poisson=surface.usage,
         wall_s=round(time.monotonic() - wall, 3),
-        cpu_s=round(time.process_time() - cpu + surface.usage.cpu_s, 3),
+        cpu_s=round(time.process_time() - cpu, 3),
     )
     events.advanced(STAGE)
     events.finished(STAGE, f"{len(mesh.faces)} triangles", **report)
@@ -105,7 +101,7 @@ def _trim(
 
     kept: NDArray[np.bool_] = np.ones(len(faces), np.bool_)
     if options.trim_density > 0.0:
-        sparse = surface.density < np.quantile(surface.density, options.trim_density)
+        sparse = around.radius > np.quantile(around.radius, 1.0 - options.trim_density)
         kept = keep("dense enough", kept & ~sparse[faces].any(axis=1))
     far = around.distance > options.trim_distance
     kept = keep("near patches", kept & ~far[faces].any(axis=1))

@@ -21,8 +21,8 @@ class SurfaceOptions:
     """Options of ``sfmapp mesh``.
 
     Attributes:
-        depth: of the octree, which divides each side of the scene's box into 2^depth; None: cells of about two patch
-            spacings.
+        depth: the finest cells are 2^depth a side of the scene's box; None: cells of about two patch spacings. Where
+            patches are sparser, cells are larger whatever is said here.
         trim_distance: surface farther than this from every patch is cut off, in units of the local patch spacing.
             At 3, of the distances and density quantiles tried on a rendered scene, accuracy and completeness were both
             best.

@@ -13,6 +13,9 @@ from sfmapp.errors import NoReconstructionError
 NUM_NEAREST = 6
 NUM_AROUND = 6
 CHUNK = 200_000
+# At least so many patches are asked how far apart they are. The distance to the sixth neighbour scatters by a fifth:
+# the median of all of them is told to a thousandth.
+_ASKED = 100_000
 
 
 @dataclass(frozen=True)
@@ -66,11 +69,13 @@ def make_patch_cloud(
 
     if len(xyz) <= NUM_AROUND:
         raise NoReconstructionError(f"surface: expected more than {NUM_AROUND} patches, found {len(xyz)}")
-    tree = cKDTree(xyz)
-    distance = tree.query(xyz, k=[NUM_AROUND + 1], workers=threads)[0][:, 0]
+    # sliding midpoints instead of medians: a fifth of the time to build, and no slower to ask for surfaces
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+    some = slice(None, None, max(len(xyz) // _ASKED, 1))
+    distance = tree.query(xyz[some], k=[NUM_AROUND + 1], workers=threads)[0][:, 0]
     # on average so many others are within that distance of a patch: the circle holds so many squares of the grid
     grid = distance * np.sqrt(np.pi / NUM_AROUND)
-    spacing = float(np.median(grid / size)) * size.astype(np.float64)
+    spacing = float(np.median(grid / size[some])) * size.astype(np.float64)
     if not spacing.min() > 0.0:
         raise NoReconstructionError("surface: expected patches at different places, found most of them at the same")
     return PatchCloud(xyz, normal, rgb, spacing, float(np.median(grid)), tree)

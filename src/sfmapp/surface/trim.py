@@ -18,11 +18,13 @@ class Surroundings:
 
     Attributes:
         distance: (N,) float32 distance to the nearest patch, in spacings of the patches there.
+        radius: (N,) float32 distance to the farthest of the nearest patches, world units: how sparse they are.
         is_backside: (N,) bool, True where all the nearest patches look the other way.
         rgb: (N, 3) uint8 colour of the nearest patches.
     """
 
     distance: NDArray[np.float32]
+    radius: NDArray[np.float32]
     is_backside: NDArray[np.bool_]
     rgb: NDArray[np.uint8]
 
@@ -35,13 +37,15 @@ def look_around(
     Colours are weighted by the inverse of the distance (Shepard 1968), as if none were nearer than half a spacing.
     """
     found = Surroundings(
-        np.empty(len(xyz), np.float32), np.empty(len(xyz), np.bool_), np.empty((len(xyz), 3), np.uint8)
-    )
+        np.empty(len(xyz), np.float32), np.empty(len(xyz), np.float32), np.empty(len(xyz), np.bool_),
+        np.empty((len(xyz), 3), np.uint8),
+    )  # fmt: skip
     for start in range(0, len(xyz), CHUNK):
         part = slice(start, start + CHUNK)
         distance, idx = patches.nearest(xyz[part], threads)
         spacing = patches.spacing[idx]
         found.distance[part] = distance[:, 0] / spacing[:, 0]
+        found.radius[part] = distance[:, -1]
         facing = np.einsum("nkc,nc->nk", patches.normal[idx], normal[part])
         found.is_backside[part] = (facing < 0.0).all(axis=1)
         weight = 1.0 / np.maximum(distance, 0.5 * spacing)
