@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Ints = NDArray[np.int64]
 
 # Images of a part at most, where the graph can be cut: those of a neighbourhood, which few rounds of adjusting bring to
-# rest. Nothing hangs on it closely (issue: leaves of 80 to 150).
+# rest. Nothing hangs on it closely.
 LARGEST_PART = 150
 # Fewer verified matches prove no geometry of a pair, and of two images that have others with ten times as many matches
 # a pair says nothing that these do not: it is left to the model of all.

@@ -56,7 +56,7 @@ _LEAST_PARALLAX = math.radians(1.0)
 _STEPS = 0.5
 # What an adjustment takes back of the variance of the drift, at most: successive ones take back the same thing in part.
 # By six rendered flights (20, 21, 22, 26, 103, 108), on which errors are 0.4 to 1.3 of their covariances with it and up
-# to three times that with 0.4. Below a thousandth it tells nothing.
+# to three times that with 0.4 (on four of them). Below a thousandth it tells nothing.
 _MOST_TAKEN, _LEAST_TAKEN = 0.15, 1e-3
 # Where more is taken back than can have drifted of late, chi-squared of six beyond what one in a million is, it is of a
 # loop or of a wrong first map, and counts the less the more it is.

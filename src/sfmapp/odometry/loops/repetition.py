@@ -15,7 +15,7 @@ from sfmapp.odometry.map.keyframe_map import KeyframeMap
 # Fewest places of a map, apart from a new one, that this could have fitted.
 _MIN_OTHERS = 5
 # Share of the places of a map that fit none of the others, where there are likes that it has not seen: 0.42 to 0.52 in
-# four halls of equal bays walked round once; 1.0 on a drive, along a block and in a furnished room.
+# four halls of equal bays walked round once; 1.0 on one drive, one block and in one furnished room of 13 places.
 _SINGLE = 0.5
 
 
