@@ -11,21 +11,29 @@ from sfmapp.geometry import rigid3
 Array = NDArray[np.float64]
 
 
+def similarity_motions(poses: Array, middle: Array, size: float) -> Array:
+    """(7, I, 6) what infinitesimal similarities of the world do to poses (I, 7): turns and scale about a middle (3,),
+    between them shifts by a size."""
+    rotation = rigid3.rotation_matrix(poses)
+    from_middle = np.einsum("nij,j->ni", rotation, middle) + poses[:, 4:]
+    motions = np.zeros((7, len(poses), 6))
+    motions[:3, :, :3] = -rotation.transpose(2, 0, 1)
+    motions[:3, :, 3:] = -(rigid3.skew(from_middle) @ rotation).transpose(2, 0, 1)
+    motions[3:6, :, 3:] = -size * rotation.transpose(2, 0, 1)
+    motions[6, :, 3:] = from_middle
+    return motions
+
+
 def similarity_basis(poses: Array) -> tuple[Array, Array]:
     """What infinitesimal similarities of the world do to poses (I, 7), and the constraint of the nearest one.
 
     Returns basis (7, I * 6), rows for turns, shifts and scale about the mean centre, all of the size of the scene, and
     constraint (7, I * 6), whose product with the errors vanishes in the gauge of inner constraints.
     """
-    rotation, centers = rigid3.rotation_matrix(poses), rigid3.center(poses)
+    centers = rigid3.center(poses)
     mean = centers.mean(0)
     size = max(float(np.sqrt(((centers - mean) ** 2).sum(1).mean())), 1e-12)
-    t = np.einsum("nij,j->ni", rotation, mean) + poses[:, 4:]
-    basis = np.zeros((7, len(poses), 6))
-    basis[:3, :, :3] = -rotation.transpose(2, 0, 1)
-    basis[:3, :, 3:] = -(rigid3.skew(t) @ rotation).transpose(2, 0, 1)
-    basis[3:6, :, 3:] = -size * rotation.transpose(2, 0, 1)
-    basis[6, :, 3:] = t
+    basis = similarity_motions(poses, mean, size)
     weight = np.repeat([size * size, 1.0], 3)
     return basis.reshape(7, -1), (basis * weight).reshape(7, -1)
 

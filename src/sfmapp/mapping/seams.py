@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.gauge import similarity_motions
 from sfmapp.adjust.graph import FactorGraph
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping.mapper import Mapper
@@ -259,19 +260,12 @@ class _Fit:
 
     def _motion(self, sim: Array) -> Array:
         """(7, N) what turns, shifts and scales of the second do to it."""
-        poses = similarity.transform_poses(sim, self._poses[1])
-        rotation, size = rigid3.rotation_matrix(poses), self._size
-        from_middle = np.einsum("nij,j->ni", rotation, self._middle) + poses[:, 4:]
-        basis = np.zeros((7, len(poses), 6))
-        basis[:3, :, :3] = -rotation.transpose(2, 0, 1)
-        basis[:3, :, 3:] = -(rigid3.skew(from_middle) @ rotation).transpose(2, 0, 1)
-        basis[3:6, :, 3:] = -size * rotation.transpose(2, 0, 1)
-        basis[6, :, 3:] = from_middle
+        of_poses = similarity_motions(similarity.transform_poses(sim, self._poses[1]), self._middle, self._size)
         away = similarity.apply(sim, self._points[1]) - self._middle
         of_points = np.concatenate(
-            [rigid3.skew(away), np.broadcast_to(size * np.eye(3), (len(away), 3, 3)), away[:, None]], 1
+            [rigid3.skew(away), np.broadcast_to(self._size * np.eye(3), (len(away), 3, 3)), away[:, None]], 1
         )
-        return np.concatenate([basis.reshape(7, -1), of_points.transpose(1, 0, 2).reshape(7, -1)], 1)
+        return np.concatenate([of_poses.reshape(7, -1), of_points.transpose(1, 0, 2).reshape(7, -1)], 1)
 
     def _weighed(self, sim: Array) -> tuple[Array, Array]:
         """Motion (7, R) and difference (R,) in standard deviations that are independent of each other."""

@@ -63,6 +63,20 @@ def place_of(code: int, place: Codes) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def load_window(values: Values, around: Ids, b: int, window: NDArray[np.float64], missing: float) -> None:
+    """The nodes, or cells, of a brick, with one more before and as many behind as the window (K, K, K) has room for;
+    ``missing`` where there is none."""
+    for z in range(window.shape[0]):
+        for y in range(window.shape[1]):
+            for x in range(window.shape[2]):
+                other = around[b, (x + 3 >> 2) + 3 * (y + 3 >> 2) + 9 * (z + 3 >> 2)]
+                if other >= 0:
+                    window[z, y, x] = values[other, (x + 3 & 3) + 4 * (y + 3 & 3) + 16 * (z + 3 & 3)]
+                else:
+                    window[z, y, x] = missing
+
+
+@numba.njit(cache=True, nogil=True)
 def _fine_codes(points: Points, shift: int) -> Codes:
     """(N,) codes of points (N, 3) in finest cells that are cut into 2^shift parts along each side."""
     codes, scale = np.empty(points.shape[0], np.int64), 1 << shift

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sfmapp.events import Events
 from sfmapp.geometry.cube_cases import EDGES, surface_loops
-from sfmapp.surface.bricks import Codes, Flags, Ids, Level, Values, place_of
+from sfmapp.surface.bricks import Codes, Flags, Ids, Level, Values, load_window, place_of
 
 Array = NDArray[np.float64]
 
@@ -123,19 +123,6 @@ def _find_simple(around: Ids, child: Ids, is_simple: Flags) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _load(values: Values, around: Ids, b: int, window: Array) -> None:
-    """The nodes of a brick with one more before and two behind, (7, 7, 7), NaN where there is none."""
-    for z in range(7):
-        for y in range(7):
-            for x in range(7):
-                other = around[b, (x + 3 >> 2) + 3 * (y + 3 >> 2) + 9 * (z + 3 >> 2)]
-                if other >= 0:
-                    window[z, y, x] = values[other, (x + 3 & 3) + 4 * (y + 3 & 3) + 16 * (z + 3 & 3)]
-                else:
-                    window[z, y, x] = np.nan
-
-
-@numba.njit(cache=True, nogil=True)
 def _case_of(window: Array, x: int, y: int, z: int) -> int:
     """Bit k: whether corner k of a cell is negative."""
     case = 0
@@ -154,7 +141,7 @@ def _number_vertices(
     for b in range(is_leaf.shape[0]):
         if not is_leaf[b]:
             continue
-        _load(values, around, b, window)
+        load_window(values, around, b, window, np.nan)
         total = 0
         for n in range(64):
             x, y, z = n & 3, n >> 2 & 3, n >> 4
@@ -202,7 +189,7 @@ def _place_vertices(cells: _Cells, table: _Table, scale: float, xyz: Array) -> N
         if not cells.is_leaf[b] or cells.vertex[b].max() < 0:
             continue
         place_of(cells.codes[b], place)
-        _load(cells.values, cells.around, b, window)
+        load_window(cells.values, cells.around, b, window, np.nan)
         for n in range(64):
             first = cells.vertex[b, n]
             if first < 0:

@@ -10,7 +10,6 @@ a plane, smoothed, solves it exactly, however the plane lies to the grid.
 
 from __future__ import annotations
 
-import resource
 import time
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.errors import NoReconstructionError
+from sfmapp.evaluation.measured import high_water_mark_mb
 from sfmapp.events import Events
 from sfmapp.reporting import Usage
 from sfmapp.surface import poisson_kernels as kernels
@@ -139,7 +139,7 @@ def poisson(
     usage = Usage(
         wall_s=round(time.monotonic() - wall, 3),
         cpu_s=round(time.process_time() - cpu, 3),
-        peak_memory_mb=round(1.024e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 1),
+        peak_memory_mb=round(high_water_mark_mb(), 1),
     )
     return ClosedSurface(vertices, faces, usage)
 

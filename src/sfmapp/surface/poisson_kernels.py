@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sfmapp.surface.bricks import Codes, Flags, Ids, Points, Values, place_of
+from sfmapp.surface.bricks import Codes, Flags, Ids, Points, Values, load_window, place_of
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def find_densities(
             if not is_loaded:
                 is_loaded = True
                 place_of(codes[b], place)
-                _load(counts, around, b, window, 0.0)
+                load_window(counts, around, b, window, 0.0)
             for axis in range(3):
                 t = points[i, axis] * scale - 4 * place[axis]
                 cell[axis] = min(max(int(t), 0), 3)
@@ -57,19 +57,6 @@ def find_densities(
                         share = weight[0, x] * weight[1, y] * weight[2, z]
                         total += share * window[cell[2] + z, cell[1] + y, cell[0] + x]
             density[i] = total / _PLANE
-
-
-@numba.njit(cache=True, nogil=True)
-def _load(values: Values, around: Ids, b: int, window: Array, missing: float) -> None:
-    """The nodes, or cells, of a brick, with one more before and as many behind as the window (K, K, K) has room for."""
-    for z in range(window.shape[0]):
-        for y in range(window.shape[1]):
-            for x in range(window.shape[2]):
-                other = around[b, (x + 3 >> 2) + 3 * (y + 3 >> 2) + 9 * (z + 3 >> 2)]
-                if other >= 0:
-                    window[z, y, x] = values[other, (x + 3 & 3) + 4 * (y + 3 & 3) + 16 * (z + 3 & 3)]
-                else:
-                    window[z, y, x] = missing
 
 
 @numba.njit(cache=True, nogil=True)
@@ -216,7 +203,7 @@ def relax(
             continue
         free = 255 if is_last else _free_corners(b, is_leaf, around, place)
         is_inside = min(place[0], place[1], place[2]) > 0 and 4 * max(place[0], place[1], place[2]) + 4 < num
-        _load(values, around, b, window, 0.0)
+        load_window(values, around, b, window, 0.0)
         for z in range(4):
             for y in range(4):
                 for x in range((colour + y + z) & 1, 4, 2):
@@ -266,7 +253,7 @@ def evaluate(
                 continue
             if not is_loaded:
                 is_loaded = True
-                _load(values, around, at[b], window, 0.0)
+                load_window(values, around, at[b], window, 0.0)
             for axis in range(3):
                 t = points[i, axis] * scale - 4 * place[axis]
                 cell[axis] = min(max(int(t), 0), 3)

@@ -53,8 +53,8 @@ class Repetition:
             place: the frame of the one that is in question; one that has a like is told nothing by others.
         """
         repeated = set(self._likes).union(*self._likes.values())
-        told = [k.frame_idx for keyframes in maps for k in keyframes.keyframes]
-        told = [frame for frame in told if frame in self._asked or frame in repeated]
         if place in repeated:
             return 0.0
+        told = [k.frame_idx for keyframes in maps for k in keyframes.keyframes]
+        told = [frame for frame in told if frame in self._asked or frame in repeated]
         return log_ratio_of_share(sum(frame not in repeated for frame in told), len(told), _SINGLE)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -138,7 +139,7 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
     import_ahead(len(image_set.images), with_factors=has_factors(run, image_set))
     correspondences = find_matches(run, image_set, keys)
     # loaded by now, beside the features, with the kernels
-    from sfmapp.mapping.divided import PartsWork
+    from sfmapp.mapping.divided import FEWEST, PartsWork
     from sfmapp.mapping.incremental import Ends, map_images
     from sfmapp.mapping.known_poses import map_known_poses
     from sfmapp.mapping.part_files import KeptParts
@@ -160,7 +161,9 @@ def _reconstruct(run: Run, image_set: ImageSet, keys: StageKeys) -> list[Reconst
         else:
             start, is_apart = (run.before.models, run.before.is_apart) if run.before is not None else ([], False)
             kept = KeptParts(run.workspace.folder / PARTS, keys.mapping)
-            with work_executor(run, image_set) as executor:
+            # workers have nothing to do in a set that is mapped as a whole
+            workers = work_executor(run, image_set) if len(image_set.images) >= FEWEST else nullcontext()
+            with workers as executor:
                 models, mapped = map_images(
                     *given, adjust_options=options.adjust, threads=threads, events=events,
                     ends=Ends(
