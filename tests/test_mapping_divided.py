@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from sfmapp.adjust.covariance import moved_to_gauge, pose_errors_in_gauge
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import project, simple_camera
 from sfmapp.camera.names import CameraModel
+from sfmapp.errors import InterruptedRunError
 from sfmapp.events import Events
 from sfmapp.executor import Threads
 from sfmapp.geometry import rigid3, similarity
@@ -26,7 +30,9 @@ from sfmapp.mapping.incremental import Ends, map_images, map_part
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.part_files import KeptParts
+from sfmapp.mapping.report import FailedPartReport, PartsReport
 from sfmapp.mapping.submaps import Part, Submap
+from sfmapp.report.parts_html import parts_section
 from sfmapp.scene.features import Features
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import SyntheticScene, true_correspondences
@@ -180,7 +186,7 @@ def features_of(scene: SyntheticScene) -> list[Features]:
 class Backwards(Threads):
     """Gives the results of units in the opposite order."""
 
-    def run(self, work, units, *, bytes_needed=None):
+    def run(self, work, units, *, bytes_needed=None, instead=None):
         yield from reversed(list(enumerate(map(work, units))))
 
 
@@ -253,6 +259,27 @@ def test_a_set_mapped_in_parts_is_that_mapped_as_a_whole_within_its_sigmas(scene
         assert 0.4 < np.sqrt((off**2).mean() / 3.0) < 1.8
 
 
+def test_the_page_tells_parts_and_seams(in_parts) -> None:
+    _, report, _ = in_parts
+    page = parts_section(report.parts)
+    for number, row in enumerate(report.parts.submaps):
+        assert f"<td>{row.num_images_of_part}</td><td>{row.num_images}</td>" in page
+        assert f"{number}: {row.first_image} ..." in page
+    for seam in report.parts.seams:
+        names = " and ".join(f"{n}: {report.parts.submaps[n].first_image} ..." for n in seam.submaps)
+        rows = [text for text in page.split("<tr>") if names in text]
+        assert len(rows) == 1
+        assert ("red" in rows[0]) == bool(seam.reason)
+        assert f"{seam.num_points_agreeing} of {seam.num_points}" in rows[0] or not seam.num_points
+    assert "as a whole" not in page
+    failed = FailedPartReport(first_image="a<b.jpg", num_images=17, reason="ValueError: x > y")
+    page = parts_section(replace(report.parts, failed=[failed], given_up="they bend"))
+    assert "a&lt;b.jpg ..." in page
+    assert "x &gt; y" in page
+    assert "as a whole after all: they bend" in page
+    assert parts_section(PartsReport()) == ""
+
+
 def mapped_as_a_whole(scene):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(divided, "FEWEST", 10**6)
@@ -274,7 +301,7 @@ class InFiles(Backwards):
         super().__init__(1)
         self.folder, self.num_done = folder, 0
 
-    def run(self, work, units, *, bytes_needed=None):
+    def run(self, work, units, *, bytes_needed=None, instead=None):
         for n, answer in super().run(pickle.loads(pickle.dumps(work)), pickle.loads(pickle.dumps(list(units)))):
             self.num_done += 1
             yield n, answer
@@ -301,17 +328,6 @@ def test_parts_in_files_and_such_as_were_kept_come_to_the_same_bytes(scene, in_p
     assert KeptParts(kept.folder, "other code").read(part) is None
 
 
-def test_workers_of_dask_map_parts_to_the_same_bytes(scene, in_parts, tmp_path):
-    pytest.importorskip("distributed")
-    from sfmapp.cluster.dask_executor import open_cluster
-
-    (expected,), _, _ = in_parts
-    with open_cluster("local:2", tmp_path, [], Events()) as executor:
-        (model,), _, _ = mapped(scene, executor)
-    np.testing.assert_array_equal(model.cam_from_world, expected.cam_from_world)
-    np.testing.assert_array_equal(model.point_xyz, expected.point_xyz)
-
-
 class Tampering(Threads):
     """Does units, and something to the models of one of them."""
 
@@ -319,7 +335,7 @@ class Tampering(Threads):
         super().__init__(1)
         self._number, self._tamper = number, tamper
 
-    def run(self, work, units, *, bytes_needed=None):
+    def run(self, work, units, *, bytes_needed=None, instead=None):
         for n, unit in enumerate(units):
             models = work(unit)
             yield n, self._tamper(models) if n == self._number else models
@@ -347,11 +363,98 @@ def test_a_part_that_contradicts_its_neighbours_is_named_and_mapped_from_their_s
     assert all(any(row.first_image in text for text in warnings) for row in left_out)
 
 
-@pytest.mark.parametrize("number", [0, 2])
-def test_a_part_that_comes_to_nothing_is_mapped_from_its_neighbours(scene, small_parts, number: int) -> None:
-    (model,), report, _ = mapped(scene, Tampering(number, lambda models: []))
+class Raising(Threads):
+    """Raises instead of doing some of the units."""
+
+    def __init__(self, error: Exception, *numbers: int) -> None:
+        super().__init__(2)
+        self._error, self._numbers = error, numbers
+
+    def run(self, work, units, *, bytes_needed=None, instead=None):
+        def done_or_raised(n: int):
+            if n in self._numbers:
+                raise self._error
+            return work(units[n])
+
+        yield from super().run(done_or_raised, range(len(units)), instead=instead)
+
+
+@pytest.mark.parametrize(
+    ("number", "executor", "reason"),
+    [
+        (0, Tampering(0, lambda models: []), "begin a model"),
+        (2, Tampering(2, lambda models: []), "begin a model"),
+        (1, Raising(ZeroDivisionError("by nothing"), 1), "ZeroDivisionError: by nothing"),
+    ],
+)
+def test_a_part_that_comes_to_nothing_is_named_and_mapped_from_its_neighbours(
+    scene, small_parts, in_parts, number: int, executor: Threads, reason: str
+) -> None:
+    (model,), report, warnings = mapped(scene, executor)
     assert model.is_registered.all()
     assert errors_in_sigmas(model, report.models[0].uncertainty, scene.ground_truth).max() < 6.0
+    (failed,) = report.parts.failed
+    assert reason in failed.reason
+    assert failed.first_image == in_parts[1].parts.submaps[number].first_image
+    assert failed.num_images == in_parts[1].parts.submaps[number].num_images_of_part
+    assert [text for text in warnings if failed.first_image in text and reason in text]
+    assert len(report.parts.submaps) == len(in_parts[1].parts.submaps) - 1
+
+
+def test_a_set_of_which_no_part_can_be_mapped_is_mapped_as_a_whole(scene, small_parts) -> None:
+    (model,), report, warnings = mapped(scene, Raising(MemoryError(), *range(20)))
+    (whole,), _, _ = mapped_as_a_whole(scene)
+    np.testing.assert_array_equal(model.cam_from_world, whole.cam_from_world)
+    assert report.parts.submaps == []
+    assert len(report.parts.failed) >= 3
+    assert report.parts.given_up
+    assert any(report.parts.given_up in text for text in warnings)
+
+
+def test_a_stop_that_is_asked_for_while_parts_are_mapped_is_no_failure_of_a_part(scene, small_parts, tmp_path) -> None:
+    kept = KeptParts(tmp_path / "kept", "this code")
+    with pytest.raises(InterruptedRunError):
+        mapped(scene, Raising(InterruptedRunError("stopped"), 1), kept=kept)
+
+
+def ended_or_mapped(work, marks, stored):
+    """Ends its process with part 1 again and again, with part 2 once; maps the others."""
+    if stored.path.name == "part_1.npz":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if stored.path.name == "part_2.npz" and not (mark := marks / "ended").exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return work(stored)
+
+
+class Ending:
+    """Workers that some parts end."""
+
+    def __init__(self, executor, marks: Path) -> None:
+        self._executor, self._marks, self.folder = executor, marks, executor.folder
+
+    def run(self, work, units, *, bytes_needed=None, instead=None):
+        yield from self._executor.run(partial(ended_or_mapped, work, self._marks), units, instead=instead)
+
+
+def test_a_part_that_ends_its_workers_is_named_and_those_in_its_company_are_mapped(scene, small_parts, tmp_path):
+    pytest.importorskip("distributed")
+    import dask
+
+    from sfmapp.cluster.dask_executor import open_cluster
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),  # of a unit, before dask gives it up
+        open_cluster("local:2", tmp_path, [], Events()) as executor,
+    ):
+        (model,), report, warnings = mapped(scene, Ending(executor, tmp_path))
+    (failed,) = report.parts.failed
+    assert "workers were lost" in failed.reason
+    assert any(failed.first_image in text for text in warnings)
+    (expected,), other, _ = mapped(scene, Raising(OSError(), 1))
+    assert [row.first_image for row in other.parts.failed] == [failed.first_image]
+    np.testing.assert_array_equal(model.cam_from_world, expected.cam_from_world)
+    np.testing.assert_array_equal(model.point_xyz, expected.point_xyz)
 
 
 # ------------------------------------------------------------------------------------------------------------- seams

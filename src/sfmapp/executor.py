@@ -13,8 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from sfmapp.errors import InterruptedRunError
+
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
 
 class Executor(Protocol):
@@ -26,8 +29,9 @@ class Executor(Protocol):
         ...
 
     def run(
-        self, work: Callable[[Unit], Result], units: Sequence[Unit], *, bytes_needed: Sequence[int] | None = None
-    ) -> Generator[tuple[int, Result], None, None]:
+        self, work: Callable[[Unit], Result], units: Sequence[Unit], *,
+        bytes_needed: Sequence[int] | None = None, instead: Callable[[Exception], Other] | None = None,
+    ) -> Generator[tuple[int, Result | Other], None, None]:  # fmt: skip
         """Do all units; results as they come, each with the position of its unit.
 
         Closing the iterator drops what has not begun and waits for what has.
@@ -36,9 +40,11 @@ class Executor(Protocol):
             work: done once for each unit or, where a worker is lost, more than once. Where there is a folder, a
                 function of a module, or a partial of one, that can be sent to another process, as can the units.
             bytes_needed: of memory by each unit, to be kept within what there is.
+            instead: makes what stands for the result of a unit that failed from what it raised; a stop that the user
+                asked for is none. None: the first failure is that of all.
 
         Raises:
-            Exception: what ``work`` raised, for the first unit that failed.
+            Exception: what ``work`` raised, for the first unit that failed, where nothing stands for its result.
         """
         ...
 
@@ -58,8 +64,9 @@ class Threads:
         self._budget = None if budget_bytes is None else _MemoryBudget(budget_bytes)
 
     def run(
-        self, work: Callable[[Unit], Result], units: Sequence[Unit], *, bytes_needed: Sequence[int] | None = None
-    ) -> Generator[tuple[int, Result], None, None]:
+        self, work: Callable[[Unit], Result], units: Sequence[Unit], *,
+        bytes_needed: Sequence[int] | None = None, instead: Callable[[Exception], Other] | None = None,
+    ) -> Generator[tuple[int, Result | Other], None, None]:  # fmt: skip
         """See :meth:`Executor.run`."""
 
         def held(n: int) -> Result:
@@ -72,7 +79,17 @@ class Threads:
             jobs: dict[Future[Result], int] = {pool.submit(held, n): n for n in range(len(units))}
             try:
                 for job in as_completed(jobs):
-                    yield jobs.pop(job), job.result()
+                    n = jobs.pop(job)
+                    result: Result | Other
+                    try:
+                        result = job.result()
+                    except InterruptedRunError:
+                        raise
+                    except Exception as error:
+                        if instead is None:
+                            raise
+                        result = instead(error)
+                    yield n, result
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 

@@ -33,6 +33,7 @@ from sfmapp.events import Events
 
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
+Other = TypeVar("Other")
 
 STAGE = "cluster"
 # How often workers are looked for, and how long a scheduler, or the bearer of a result, may take to answer.
@@ -41,6 +42,10 @@ _LOOK_S, _ANSWER_S = 2.0, 20.0
 _AHEAD = 2
 # A result that was lost with its worker before it came here.
 _LOST = (TimeoutError, CancelledError, CommClosedError)
+
+
+class LostWorkersError(WorkerError):
+    """One worker after another was lost while it had a unit of work."""
 
 
 @contextmanager
@@ -106,9 +111,13 @@ class DaskExecutor:
         self._is_waiting = False
 
     def run(
-        self, work: Callable[[Unit], Result], units: Sequence[Unit], *, bytes_needed: Sequence[int] | None = None
-    ) -> Generator[tuple[int, Result], None, None]:
+        self, work: Callable[[Unit], Result], units: Sequence[Unit], *,
+        bytes_needed: Sequence[int] | None = None, instead: Callable[[Exception], Other] | None = None,
+    ) -> Generator[tuple[int, Result | Other], None, None]:  # fmt: skip
         """See :meth:`~sfmapp.executor.Executor.run`; how much memory a unit may take is for the workers to say.
+
+        A unit that lost its workers may have been in the company of the one that ended them, and is tried again alone
+        before something stands for its result.
 
         Raises:
             WorkerError: a worker's memory is too small for a unit, or units end their workers again and again.
@@ -116,11 +125,14 @@ class DaskExecutor:
         """
         answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         jobs: dict[Any, tuple[int, frozenset[str]]] = {}
-        waiting = deque(range(len(units)))
-        num_left = len(units)
+        waiting, blamed = deque(range(len(units))), deque[int]()
+        num_left, is_alone = len(units), False
         try:
             while num_left:
                 self._look_for_workers()
+                if blamed and not waiting and not jobs:
+                    waiting.append(blamed.popleft())
+                    is_alone = True
                 for job in [job for job, (_, workers) in jobs.items() if not workers & self._fit.keys()]:
                     waiting.appendleft(jobs.pop(job)[0])  # all that may do it are gone: it would wait for ever
                     job.cancel()
@@ -134,11 +146,19 @@ class DaskExecutor:
                     self._events.raise_if_cancelled()
                     continue
                 n, _ = jobs.pop(job)
+                result: Result | Other
                 try:
                     result = _result(job)
                 except _LOST:
                     waiting.appendleft(n)
                     continue
+                except Exception as error:
+                    if instead is None:
+                        raise
+                    if isinstance(error, LostWorkersError) and not is_alone:
+                        blamed.append(n)
+                        continue
+                    result = instead(error)
                 num_left -= 1
                 yield n, result
         finally:
@@ -196,7 +216,7 @@ def _result(job: Any) -> Any:
     try:
         return job.result(timeout=_ANSWER_S)
     except KilledWorker as error:
-        raise WorkerError(
+        raise LostWorkersError(
             f"{error.allowed_failures + 1} workers were lost over one unit of work, {error.last_worker.address} last",
             "the reason is in their logs; often it is memory: give workers more, or fewer threads each",
         ) from error

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from sfmapp.errors import SfmError
 from sfmapp.events import Events
 from sfmapp.executor import Executor
 from sfmapp.mapping.assembly import Assembly, assemble, union
@@ -20,7 +21,7 @@ from sfmapp.mapping.division import divide
 from sfmapp.mapping.mapper import STAGE, Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.part_files import KeptParts, map_stored, read_models, store_part
-from sfmapp.mapping.report import PartsReport, SeamReport, SubmapReport
+from sfmapp.mapping.report import FailedPartReport, PartsReport, SeamReport, SubmapReport
 from sfmapp.mapping.seams import Seam, find_common, fit_seam, joint_covariances
 from sfmapp.mapping.submaps import Part, Submap
 from sfmapp.mapping.tracks import USELESS_CONFIGS
@@ -63,6 +64,24 @@ class Divided:
         ]
         return agreeing[0] < agreeing[1] - MAX_LOST_AGREEMENT
 
+    def given_up(self, reason: str, events: Events) -> Divided:
+        """Nothing but the report, and in it why all images are mapped as a whole after all."""
+        events.warned(STAGE, f"{reason}: mapping all images as a whole")
+        return Divided([], replace(self.report, given_up=reason))
+
+
+@dataclass(frozen=True)
+class PartFailure:
+    """What stands for the models of a part that could not be mapped: why."""
+
+    reason: str
+
+    @staticmethod
+    def of(error: Exception) -> PartFailure:
+        """What a part, or the worker that had it, raised."""
+        known = isinstance(error, SfmError)
+        return PartFailure(str(error) if known else f"{type(error).__name__}: {error}")
+
 
 @dataclass(frozen=True)
 class PartsWork:
@@ -97,54 +116,71 @@ class InParts:
         if not parts:
             return Divided([])
         mapper = mapper_of(empty)
-        submaps = self._mapped(parts, mapper.events)
+        submaps, failed = self._mapped(parts, mapper.events)
         models, report = joined(submaps, empty, partial(_mapper_of_part, mapper), mapper.options, mapper.events)
+        found = Divided(models, replace(report, failed=failed), submaps)
+        if not models:
+            return found.given_up("no part came to a model", mapper.events)
         for model in models:
             _set_up(model, mapper_of(model))
-        return Divided(models, report, submaps)
+        return found
 
-    def _mapped(self, parts: Sequence[Part], events: Events) -> list[Submap]:
-        """What the parts come to, in their order, whoever is done first."""
+    def _mapped(self, parts: Sequence[Part], events: Events) -> tuple[list[Submap], list[FailedPartReport]]:
+        """What the parts come to, in their order, whoever is done first, and those that come to nothing."""
         sizes = [len(part.image_idx) for part in parts]
-        found: dict[int, list[Reconstruction]] = {}
+        found: dict[int, list[Reconstruction] | PartFailure] = {}
         events.started(_STEP, f"{len(parts)} parts of {min(sizes)} to {max(sizes)} images", total=len(parts))
         with closing(self._answers(parts, events)) as answers:
             for n, models in answers:
-                found[n] = models
-                registered = [int(model.is_registered.sum()) for model in models]
+                found[n] = models or PartFailure("no two of its images begin a model")
+                registered = [] if isinstance(models, PartFailure) else [int(m.is_registered.sum()) for m in models]
                 text = f"{' + '.join(map(str, registered)) or 'none'} of {sizes[n]} images of part {n}"
                 events.decided(STAGE, text)
                 events.advanced(_STEP, message=text)
         events.finished(_STEP)
-        return [Submap(part, model) for n, part in enumerate(parts) for model in found[n]]
+        submaps, failed = [], []
+        for n, part in enumerate(parts):
+            models = found[n]
+            if not isinstance(models, PartFailure):
+                submaps += [Submap(part, model) for model in models]
+                continue
+            failed.append(FailedPartReport(
+                first_image=part.image_names[0], num_images=sizes[n], reason=models.reason
+            ))  # fmt: skip
+            events.warned(
+                STAGE,
+                f"part {n} ({part.image_names[0]} and {sizes[n] - 1} more images) came to nothing, and its images are "
+                f"registered from where its neighbours are: {models.reason}",
+            )
+        return submaps, failed
 
     def _answers(
         self, parts: Sequence[Part], events: Events
-    ) -> Generator[tuple[int, list[Reconstruction]], None, None]:
+    ) -> Generator[tuple[int, list[Reconstruction] | PartFailure], None, None]:
         """Models of the parts as they come, those first that an earlier run has kept."""
         kept, executor = self.work.kept, self.work.executor
         waiting = []
         for n, part in enumerate(parts):
-            models = kept.read(part) if kept is not None else None
-            if models is None:
+            known = kept.read(part) if kept is not None else None
+            if known is None:
                 waiting.append(n)
             else:
-                yield n, models
+                yield n, known
         for k, models in self._made(executor, [parts[n] for n in waiting], events):
-            if kept is not None:
+            if kept is not None and not isinstance(models, PartFailure):  # which the next run may not have
                 kept.write(parts[waiting[k]], models)
             yield waiting[k], models
 
     def _made(
         self, executor: Executor, parts: Sequence[Part], events: Events
-    ) -> Generator[tuple[int, list[Reconstruction]], None, None]:
+    ) -> Generator[tuple[int, list[Reconstruction] | PartFailure], None, None]:
         """Models of parts that an executor maps, as they come."""
         if executor.folder is None:
-            yield from executor.run(partial(self.map_part, events.unheard()), parts)
+            yield from executor.run(partial(self.map_part, events.unheard()), parts, instead=PartFailure.of)
             return
         stored = [store_part(executor.folder, n, part) for n, part in enumerate(parts)]
-        for n, path in executor.run(partial(map_stored, self.map_part), stored):
-            yield n, read_models(path, parts[n])
+        for n, path in executor.run(partial(map_stored, self.map_part), stored, instead=PartFailure.of):
+            yield n, path if isinstance(path, PartFailure) else read_models(path, parts[n])
 
 
 def parts_of(empty: Reconstruction, correspondences: Correspondences) -> list[Part]:

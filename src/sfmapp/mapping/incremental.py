@@ -218,7 +218,7 @@ class _Task:
             begun = divided.models
         models, initial_reports = _grow_models(empty, mapper_of, starts, begun, is_apart=is_apart)
         if divided.models and divided.is_bent(models, correspondences):
-            events.warned(STAGE, "parts do not make a model that holds together: mapping all images as a whole")
+            divided = divided.given_up("parts do not make a model that holds together", events)
             models, initial_reports = _grow_models(empty, mapper_of, starts)
         models, apart = _merge_models(_without_parts(models), mapper_of, correspondences, options, events)
         models = _with_left_over(models, mapper_of, correspondences, events)

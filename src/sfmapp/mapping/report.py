@@ -226,11 +226,25 @@ class SeamReport(Report):
     reason: str
 
 
+class FailedPartReport(Report):
+    """A part of the images that came to no model: they are registered from where their neighbours are."""
+
+    first_image: str
+    num_images: int
+    reason: str
+
+
 class PartsReport(Report):
-    """A set of images that was mapped in parts; empty where it was mapped as a whole."""
+    """A set of images that was mapped in parts; empty where it was mapped as a whole from the first.
+
+    Attributes:
+        given_up: why it was mapped as a whole after all; empty if it was not.
+    """
 
     submaps: Sequence[SubmapReport] | None = None
     seams: Sequence[SeamReport] | None = None
+    failed: Sequence[FailedPartReport] | None = None
+    given_up: str = ""
 
 
 class MappingReport(Report):

@@ -12,6 +12,7 @@ from sfmapp.report.control_html import control_section, poses_section, units_sec
 from sfmapp.report.dense_html import dense_section
 from sfmapp.report.model import CameraReport, ImageReport, ReconstructionReport
 from sfmapp.report.page import adjustment_table, check_table, failure_box, log_table, render_page, table, usage_table
+from sfmapp.report.parts_html import parts_section
 from sfmapp.report.plan import PlanCheck
 from sfmapp.report.top_view import top_view_svg
 from sfmapp.report.video_html import videos_section
@@ -97,6 +98,7 @@ def render_html(
     body.append("<h2>Images</h2>" + _images(report.images) + _starts(report))
     body.append("<h2>Cameras</h2>" + _cameras(report.cameras))
     if report.stages.mapping is not None:
+        body.append(parts_section(report.stages.mapping.parts))
         entries = enumerate(report.stages.mapping.models)
         body.append(adjustment_table((f"model {m}", model.adjustment) for m, model in entries))
     body.append(usage_table(report.usage, report.run))
