@@ -132,6 +132,22 @@ def adjust_projective(
     return found, AdjustmentInfo(taken, rms, sigma, np.asarray(within, np.bool_))
 
 
+def noise_of_places(model: ProjectiveModel, seen: Sightings, frame: Array, sigma_px: float) -> Array:
+    """(N, 3, 3) covariances of where a frame (4, 4) puts the points, of the noise of their own pixels by cameras that
+    stand; every point is to be seen in two views."""
+    camera = (model.cameras @ np.linalg.inv(frame))[seen.view_idx]
+    place = model.points @ frame.T
+    place /= place[:, 3:]
+    mapped = np.einsum("oij,oj->oi", camera, place[seen.point_idx])
+    pixel = mapped[:, :2] / mapped[:, 2:]
+    by_place = (camera[:, :2, :3] - pixel[:, :, None] * camera[:, 2:, :3]) / mapped[:, 2, None, None]
+    told = _Groups.of(seen.point_idx, len(place)).sums(by_place.swapaxes(1, 2) @ by_place)
+    # rays that are all but one leave the depth open: large, and not an error
+    depth = 1e-12 * np.trace(told, axis1=1, axis2=2)
+    covariances: Array = sigma_px**2 * np.linalg.inv(told + depth[:, None, None] * np.eye(3))
+    return covariances
+
+
 def _unit(model: ProjectiveModel) -> ProjectiveModel:
     return ProjectiveModel(
         model.cameras / np.linalg.norm(model.cameras, axis=(1, 2), keepdims=True),

@@ -33,8 +33,9 @@ _LIMIT = 3.3
 
 
 def find_space_homography(
-    points: ArrayLike, xyz: ArrayLike, *, sigma: float | None = None, is_robust: bool = False, seed: int = 0
-) -> tuple[Array, FitInfo]:
+    points: ArrayLike, xyz: ArrayLike, *, sigma: float | None = None, covariances: Array | None = None,
+    is_robust: bool = False, seed: int = 0,
+) -> tuple[Array, FitInfo]:  # fmt: skip
     """The frame in which points stand where they are known to be: ``(xyz, 1) ~ G X``, least squared distance in space.
 
     Args:
@@ -42,14 +43,16 @@ def find_space_homography(
         xyz: (N, 3) where they are known to be.
         sigma: standard deviation of a known coordinate, the projective points' own noise included; None: as what is
             left of more than five points tells.
+        covariances: (N, 3, 3) of the distances between both, in the squared unit of ``xyz``: points count by how firmly
+            they stand, and ``sigma`` is not used. None: all count alike.
         is_robust: some may be wrong: samples of five by the least median. Of seven points or more: below, nothing
             could say which one is wrong, and all count.
         seed: of the samples, where not all are tried.
 
     Returns:
         G (4, 4) of unit norm. ``covariance`` (16, 16) of its entries, None for five points without ``sigma``;
-        ``sigma_px`` is that of a coordinate, in the unit of ``xyz``; ``num_free`` is above 1 where points in one plane
-        leave the frame open.
+        ``sigma_px`` is that of a coordinate, in the unit of ``xyz``, or with ``covariances`` the factor by which what
+        is left exceeds them; ``num_free`` is above 1 where points in one plane leave the frame open.
 
     Raises:
         ValueError: fewer than five points, or some that are not finite.
@@ -63,17 +66,24 @@ def find_space_homography(
     if is_robust and len(x) >= MIN_POINTS + MIN_VOTERS:
         is_inlier, taken = _least_median(white, target, seed)
     white, target = white[is_inlier], target[is_inlier]
+    weights = np.broadcast_to(np.eye(3), (len(white), 3, 3))
+    if covariances is not None:
+        weights = np.linalg.inv(np.linalg.cholesky(covariances[is_inlier])) / about[0, 0]
     rows = _rows(white, target)
     _, values, vt = np.linalg.svd(rows, full_matrices=len(rows) < 16)
     values = np.pad(values, (0, 16 - len(values)))
-    frame, by_frame, hessian, steps = _refined(vt[15].reshape(4, 4), white, target)
-    left = dehomogenized(white @ frame.T) - target
+    frame, by_frame, hessian, steps = _refined(vt[15].reshape(4, 4), white, target, weights)
+    left = (weights @ (dehomogenized(white @ frame.T) - target)[:, :, None])[:, :, 0]
     num_left = 3 * len(white) - 15
-    unit = float(np.sqrt((left**2).sum() / num_left)) if num_left > 0 else math.nan
+    unit = told = float(np.sqrt((left**2).sum() / num_left)) if num_left > 0 else math.nan
     if sigma is not None:
-        unit = sigma * about[0, 0]
+        unit = told = sigma * about[0, 0]
+    coordinate = 0.0 if math.isnan(unit) else unit
+    if covariances is not None:
+        unit, told = 1.0, told * about[0, 0]
+        coordinate = about[0, 0] * math.sqrt(float(np.median(np.trace(covariances[is_inlier], axis1=1, axis2=2))) / 3.0)
     # an entry of a row has the noise of a coordinate times one of a unit vector
-    noise = np.full(16, (0.0 if math.isnan(unit) else unit) * math.sqrt(len(rows) / 16.0) + 1e-11 * values[0])
+    noise = np.full(16, coordinate * math.sqrt(len(rows) / 16.0) + 1e-11 * values[0])
     num_free = max(count_free(values, noise), 1)
     found = np.linalg.solve(about, frame) @ whitening
     norm = float(np.linalg.norm(found))
@@ -85,7 +95,7 @@ def find_space_homography(
         by_step -= np.outer(found.ravel(), found.ravel() @ by_step)
         covariance = unit**2 * by_step @ cofactor @ by_step.T
     condition = float(values[0] / max(values[14], 1e-300))
-    return found, FitInfo(is_inlier, taken + steps, condition, values, num_free, unit / about[0, 0], covariance)
+    return found, FitInfo(is_inlier, taken + steps, condition, values, num_free, told / about[0, 0], covariance)
 
 
 def _known(points: ArrayLike, xyz: ArrayLike) -> tuple[Array, Array]:
@@ -129,8 +139,9 @@ def _least_median(points: Array, xyz: Array, seed: int) -> tuple[Mask, int]:
     return lengths[best] <= max(_LIMIT * sigma, 1e-9), len(samples)
 
 
-def _refined(frame: Array, points: Array, xyz: Array) -> tuple[Array, Array, Array, int]:
-    """The frame of least squared distance; the directions (16, 15) it moved in, the Hessian (15, 15), and steps."""
+def _refined(frame: Array, points: Array, xyz: Array, weights: Array) -> tuple[Array, Array, Array, int]:
+    """The frame of least squared distance, whitened by (N, 3, 3); the directions (16, 15) it moved in, the Hessian
+    (15, 15), and steps."""
 
     def tangent(g: Array) -> Array:
         basis: Array = np.linalg.svd(g.reshape(1, 16))[2][1:].T
@@ -140,8 +151,8 @@ def _refined(frame: Array, points: Array, xyz: Array) -> tuple[Array, Array, Arr
         mapped = points @ g.T
         seen = mapped[:, :3] / mapped[:, 3:]
         slopes = _rows(points, seen).reshape(-1, 3, 16) / mapped[:, 3, None, None]
-        jacobian = slopes.reshape(-1, 16) @ tangent(g)
-        left = (xyz - seen).ravel()
+        jacobian = (weights @ slopes).reshape(-1, 16) @ tangent(g)
+        left = (weights @ (xyz - seen)[:, :, None]).ravel()
         return float(left @ left), jacobian.T @ jacobian, -jacobian.T @ left
 
     def moved(g: Array, step: Array) -> Array:

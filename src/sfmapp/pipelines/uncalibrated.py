@@ -275,7 +275,8 @@ def _metric_report(metric: MetricModel | None) -> SelfCalibrationReport | None:
 def _known_report(known: KnownFrame | None, found: ProjectiveReconstruction) -> KnownPointsReport | None:
     if known is None:
         return None
-    sigmas = known.sigmas_of(found.model.points)
+    covariances = known.covariances_of(found)
+    sigmas = None if covariances is None else np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
     return KnownPointsReport(
         num_used=sum(one.is_used for one in known.points), sigma=known.sigma if math.isfinite(known.sigma) else None,
         condition=known.condition, median_point_sigma=None if sigmas is None else float(np.nanmedian(sigmas)),

@@ -71,7 +71,8 @@ class KnownPointsReport(Report):
     """The frame of the world, by points of known place.
 
     Attributes:
-        num_used: that agree. sigma: of a known coordinate as what is left tells it; absent for five points.
+        num_used: that agree. sigma: of a known coordinate as what is left tells beyond the noise of the marks; absent
+            for five points.
         condition: of the equations. median_point_sigma: of the model's points, along the longest axis; absent for five.
         points: each.
     """
@@ -159,7 +160,7 @@ def _known(told: KnownPointsReport) -> Iterator[str]:
     sigma = (
         "five points leave nothing over to check them by"
         if told.sigma is None
-        else f"what is left says {told.sigma:.3g}"
+        else f"what is left says {told.sigma:.3g} beyond the noise of its marks"
     )
     spread = (
         ""
