@@ -55,7 +55,7 @@ FPS = 20.0
 _FIRST = 5
 # Those before were looked at while the filter was made, and so were the ones named here.
 FIRST_FLIGHT = 20
-CHOSE = (20, 21, 22, 24, 26, 100, 101, 102, 103, 104)
+CHOSE = (20, 21, 22, 24, 26, 28, *range(100, 109), 110)
 FIRST_SMALL = 100
 
 
@@ -153,8 +153,9 @@ def bridged(
         return None
     nothing = np.full(7, np.nan)
     frames = [
-        replace(frame, cam_from_world=nothing) if begin_s <= frame.timestamp_s < begin_s + gap_s else frame
+        replace(frame, cam_from_world=nothing) if begin_s <= frame.timestamp_s else frame
         for frame in seen
+        if frame.timestamp_s < begin_s + gap_s
     ]
     found = filtered(frames, *sensor)
     if found is None:

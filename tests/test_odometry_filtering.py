@@ -401,6 +401,21 @@ def test_what_adjustments_take_back_of_the_drift_is_taken_back_in_the_world() ->
     assert 0.2 < np.mean(np.concatenate(errors)) / 6 < 1.0
 
 
+def test_what_adjustments_take_back_in_a_gap_is_not_taken_for_drift_of_before() -> None:
+    """A map that goes on without the filter drifts, and is put right, as if there were no gap; at its end the camera is
+    where the sensor alone says."""
+    shared, adjusted, gap = Shared(0.1, 0.2), range(10, 240, 10), range(100, 160)
+    for seed, case in enumerate(CASES[:4]):
+        poses, moved = drifting(case, seed, shared, adjusted)
+        poses[gap] = np.nan
+        found, _ = with_shared(case, poses, shared, moved)
+        alone, _ = with_shared(case, poses, shared, {frame: moved[frame] for frame in adjusted if frame not in gap})
+        rows = found.frame_row[gap]
+        apart = tangent(found.cam_from_world[rows], alone.cam_from_world[rows])
+        np.testing.assert_allclose(apart, 0.0, atol=1e-9)
+        np.testing.assert_allclose(found.covariance[rows], alone.covariance[rows], rtol=1e-6)
+
+
 def test_a_map_that_is_adjusted_is_no_motion() -> None:
     """Nor is a loop that closes, which gives the map another unit as well."""
     case = CASES[1]

@@ -189,11 +189,12 @@ class FilterState:
         change[_CP, _S] = -self._center()[:, None]
         self._p = change @ self._p @ change.T
 
-    def move_map(self, moved: Array) -> None:
+    def move_map(self, moved: Array, *, is_followed: bool = True) -> None:
         """The map was put elsewhere: a place x of it was at moved(x), a similarity (8,). The camera stays, but for what
-        that tells of where it was."""
+        that tells of where it was: nothing if the map went on without poses that were followed here, as its drift
+        since then is not known of."""
         back = similarity.inverse(moved)
-        if not np.array_equal(moved, similarity.IDENTITY):
+        if is_followed and not np.array_equal(moved, similarity.IDENTITY):
             self._take_back(self._there - similarity.apply(back, self._there), rigid3.rotation_matrix(moved))
         turn, size = rigid3.rotation_matrix(back), float(back[7])
         self._position, self._shift = similarity.apply(back, self._position), similarity.apply(back, self._shift)

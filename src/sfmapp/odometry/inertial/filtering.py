@@ -266,6 +266,7 @@ class InertialFilter:
         self._anchor_s = self._head_s = self._used_s = -math.inf
         self._samples: list[_Sample] = []  # from the last one before the anchor on
         self._in_a_row, self._is_waiting, self._interval_s = 0, False, math.inf
+        self._had_pose = False  # the last frame
         self._since_forgotten = _WINDOW  # frames since what was predicted was forgotten
         self._rows, self._recent = FilteredRows(), deque[float](maxlen=_WINDOW)
         self._innovation, self._is_rejected, self._frame_row = array("d"), array("b"), array("q")  # of each frame
@@ -301,12 +302,14 @@ class InertialFilter:
             pose: centre (3,), rotation world_from_cam (3, 3) and their covariance (6, 6); None of a frame without.
             shared: how far its error is that of the frames before.
             map_moved: (8,) a place x of the map was at map_moved(x) in the frame before: what an adjustment or a loop
-                has changed is no motion, and the sensor knew nothing of it.
+                has changed is no motion, and the sensor knew nothing of it. In a gap, and right after it, it is not
+                read as drift taken back: the map may have drifted meanwhile.
 
         Returns:
             The normalised innovation squared of a pose that was not believed; None otherwise.
         """
         begin = time.perf_counter()
+        is_followed, self._had_pose = self._had_pose and pose is not None, pose is not None
         self._frame_row.append(-1)
         self._innovation.extend([math.nan] * 6)
         self._is_rejected.append(False)
@@ -318,7 +321,7 @@ class InertialFilter:
             return None
         at_frame = self._anchor.copied()
         self._go_through(at_frame, self._anchor_s, timestamp_s)
-        at_frame.move_map(map_moved)
+        at_frame.move_map(map_moved, is_followed=is_followed)
         is_used = pose is not None and self._correct(at_frame, pose, shared)
         if self._anchor is None:
             assert pose is not None
