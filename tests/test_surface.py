@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene, DenseView, Region
 from sfmapp.errors import InterruptedRunError, NoReconstructionError, UsageError
-from sfmapp.events import Event, Events
+from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.scene.mesh import face_vectors
 from sfmapp.surface import child, gaps, poisson, trim
@@ -217,25 +217,6 @@ def test_cancelling_kills_the_child(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert time.monotonic() - start < 10.0
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), signal.SIG_DFL)
-
-
-def test_a_child_that_takes_long_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code = "import sys, time, numpy as np\ntime.sleep(0.5)\nnp.savez(sys.argv[2], x=np.ones(1))\n"
-    (tmp_path / "patient_child.py").write_text(code)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(child, "TELL_EVERY_S", 0.1)
-    told: list[Event] = []
-    events = Events(told.append)
-    events.started("mesh", total=4)
-    found, _ = child.run_child("patient_child", "task", {"x": np.zeros(1)}, (), "", events, stage="mesh")
-    assert found["x"] == 1
-    messages = [event for event in told if event.kind == "advanced"]
-    assert len(messages) >= 3
-    assert all(event.message.startswith("task, for ") and event.done == 0 for event in messages)
-    # without a stage nobody is
-    told.clear()
-    child.run_child("patient_child", "task", {"x": np.zeros(1)}, (), "", events)
-    assert not told
 
 
 def test_the_result_does_not_depend_on_threads() -> None:

@@ -11,6 +11,7 @@ from sfmapp.geometry.cube_cases import EDGES, surface_loops
 from sfmapp.scene.mesh import enclosed_volume, face_vectors, vertex_normals
 from sfmapp.surface import bricks, poisson, poisson_kernels
 from sfmapp.surface.poisson import BOX_SCALE
+from sfmapp.surface.trim import rim
 
 Array = NDArray[np.float64]
 
@@ -157,6 +158,27 @@ def test_two_balls_and_a_hollow_one_keep_their_sides() -> None:
     assert (times_met(surface.faces) == 2).all()
     volume = 4.0 / 3.0 * np.pi * (1.0 - 0.6**3 + 0.5**3)
     assert enclosed_volume(surface.xyz, surface.faces) == pytest.approx(volume, rel=0.01)
+
+
+def test_a_surface_that_leaves_the_box_is_closed_at_its_sides() -> None:
+    """Of a square, which has no inside of its own."""
+    rng = np.random.default_rng(4)
+    xyz = np.column_stack([rng.uniform(-1.0, 1.0, (20_000, 2)), np.zeros(20_000)])
+    surface = poisson.poisson(xyz, np.tile(np.float32([0.0, 0.0, 1.0]), (len(xyz), 1)), 7)
+    assert np.abs(surface.xyz).max() > 0.98 * BOX_SCALE
+    assert (times_met(surface.faces) == 2).all()
+    assert is_oriented(surface.faces)
+
+
+def test_the_rim_is_what_has_one_face() -> None:
+    rng = np.random.default_rng(5)
+    faces = np.array([rng.choice(12, 3, replace=False) for _ in range(40)], np.int32)
+    walks = [(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)]
+    sides = [tuple(sorted(walk)) for walk in walks]
+    expected = sorted((side, walk) for side, walk in zip(sides, walks, strict=True) if sides.count(side) == 1)
+    assert 3 < len(expected) < len(walks)
+    assert rim(faces).tolist() == [list(walk) for _, walk in expected]
+    assert rim(faces[:0]).shape == (0, 2)
 
 
 def test_cells_are_cut_alike_on_both_sides_of_a_face() -> None:

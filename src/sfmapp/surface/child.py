@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,6 @@ from sfmapp.events import Events
 
 AnyArray = NDArray[Any]
 
-TELL_EVERY_S = 2.0
-
 
 def run_child(
     module: str,
@@ -29,9 +26,7 @@ def run_child(
     arguments: tuple[object, ...],
     advice: str,
     events: Events,
-    *,
-    stage: str | None = None,
-) -> tuple[dict[str, AnyArray], ProcessUsage]:
+) -> dict[str, AnyArray]:
     """Run ``python -m module INPUT OUTPUT ARGUMENTS`` and hand its arrays back.
 
     Args:
@@ -41,10 +36,9 @@ def run_child(
         arguments: further ones, as they print.
         advice: what the user can do when it fails.
         events: asked many times a second whether to go on; the child is killed if not.
-        stage: which is told every few seconds that the child is still at work; None: nobody is told.
 
     Returns:
-        The arrays of OUTPUT and what the child took.
+        The arrays of OUTPUT.
 
     Raises:
         NoReconstructionError: the child ended without a result.
@@ -56,29 +50,13 @@ def run_child(
         # -P: whatever lies in the working folder is not imported
         command = [sys.executable, "-P", "-m", module, str(source), str(target), *map(str, arguments)]
         try:
-            usage = run_measured(command, log, on_tick=_Watch(task, stage, events))
+            usage = run_measured(command, log, on_tick=events.raise_if_cancelled)
         except OSError as error:
             raise NoReconstructionError(f"{task}: its process did not start: {error.strerror or error}") from error
         if usage.exit_code != 0 or not target.is_file():
             raise NoReconstructionError(f"{task}: {_ending(usage, log)}", advice)
         with np.load(target, allow_pickle=False) as data:
-            return {key: data[key] for key in data.files}, usage
-
-
-class _Watch:
-    """Asks whether to go on, and tells a stage now and then for how long its child has been at work."""
-
-    def __init__(self, task: str, stage: str | None, events: Events) -> None:
-        self._task, self._stage, self._events = task, stage, events
-        self._start = self._told = time.monotonic()
-
-    def __call__(self) -> None:
-        now = time.monotonic()
-        if self._stage is None or now < self._told + TELL_EVERY_S:
-            self._events.raise_if_cancelled()
-            return
-        self._told = now
-        self._events.advanced(self._stage, 0, f"{self._task}, for {now - self._start:.0f} s")
+            return {key: data[key] for key in data.files}
 
 
 def _ending(usage: ProcessUsage, log: Path) -> str:

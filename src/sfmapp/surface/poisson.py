@@ -132,7 +132,7 @@ def poisson(
     vertices, faces = dual_surface(levels, values, events)
     if len(faces) == 0:
         raise NoReconstructionError("Poisson reconstruction: found no surface", ADVICE)
-    vertices, faces = _with_lids(vertices, faces)
+    vertices, faces = _with_lids(vertices, faces, depth)
     vertices -= middle
     vertices *= cell
     vertices += center
@@ -243,9 +243,15 @@ def _pass_through_points(
     kernels.take_away(level.codes, level.is_leaf, np.bool_(is_whole), level.around, total, count, DOUBT, values)
 
 
-def _with_lids(xyz: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The surface closed where it leaves the box: each loop of its rim gets a fan about its centre."""
-    edges = rim(faces)
+def _with_lids(
+    xyz: NDArray[np.float64], faces: NDArray[np.int32], depth: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:  # fmt: skip
+    """The surface, in finest cells, closed where it leaves the box: loops of its rim get a fan about their centre."""
+    # it leaves the box through cells at its sides, and none is larger than the coarsest
+    side, coarsest = float(1 << depth), float(1 << max(depth - COARSEST_DEPTH, 0))
+    is_near = np.any((xyz <= coarsest) | (xyz >= side - coarsest), axis=1)
+    edges = rim(faces[is_near[faces].any(axis=1)])
+    edges = edges[is_near[edges].all(axis=1)]
     if not len(edges):
         return xyz, faces
     loop = pieces(edges, len(xyz))

@@ -35,8 +35,7 @@ class MeshReport(Report):
         spacing: of the patches, world units.
         num_rim_edges: 0 for a closed mesh.
         funnel: triangles left after each step.
-        poisson: what the child process took.
-        cpu_s: child included.
+        poisson: what Poisson took of it.
         texture: absent without.
     """
 

@@ -166,7 +166,7 @@ def _pack(
         "area": np.array(covered),
     }
     module, advice = "sfmapp.surface.pack_child", "try a smaller surface.depth"
-    found, _ = run_child(module, "packing the texture", arrays, (side, PADDING_TEXELS), advice, events)
+    found = run_child(module, "packing the texture", arrays, (side, PADDING_TEXELS), advice, events)
     if not np.array_equal(found["vertex_idx"][found["faces"]], charts.faces):
         raise NoReconstructionError("packing the texture: expected the same triangles back, found others", advice)
     places = np.empty((len(charts.pixels), 2))

@@ -98,7 +98,18 @@ def without_islands(
 
 def rim(faces: NDArray[np.int32]) -> NDArray[np.int32]:
     """(R, 2) edges, as pairs of vertices in the order of their face, that have a face on one side only."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    _, first, counts = np.unique(low.astype(np.int64) << 32 | high, return_index=True, return_counts=True)
-    return np.asarray(edges[first[counts == 1]])
+    # smaller vertex, larger one, whether the face has the larger first: sorted, the faces of an edge follow each other
+    keys = np.empty(3 * len(faces), np.int64)
+    for side in range(3):
+        start, end, mine = faces[:, side], faces[:, (side + 1) % 3], keys[side::3]
+        mine[:] = np.minimum(start, end)
+        mine <<= 32
+        mine |= np.maximum(start, end).astype(np.int64) << 1
+        mine |= start > end
+    keys.sort()
+    is_alone = np.ones(len(keys), np.bool_)
+    is_alone[1:] = (keys[1:] ^ keys[:-1]) > 1
+    is_alone[:-1] &= is_alone[1:]
+    keys = keys[is_alone]
+    edges = np.stack([keys >> 32, (keys & 0xFFFFFFFF) >> 1], axis=1).astype(np.int32)
+    return np.where(((keys & 1) == 1)[:, None], edges[:, ::-1], edges)

@@ -110,7 +110,7 @@ def _worth(
         "view_ptr": view_ptr,
     }
     module, advice = "sfmapp.surface.occlusion_child", "try a smaller surface.depth"
-    found, _ = run_child(module, "finding what is hidden", arrays, (), advice, events)
+    found = run_child(module, "finding what is hidden", arrays, (), advice, events)
     return worth, np.split(found["hidden"], view_ptr[1:-1])
 
 
