@@ -78,7 +78,8 @@ load_numba_sparingly()
 import numpy as np, kernels
 for name in sys.argv[1:]:
     print(getattr(kernels, name)(np.array([3.0, 1.0, 2.0])))
-print("numba.np.arraymath" in sys.modules, "scipy.linalg" in sys.modules)
+read = [made.library._shared_module is not None for made in kernels.total.overloads.values()]
+print("numba.np.arraymath" in sys.modules, "scipy.linalg" in sys.modules, *read)
 """
 
 
@@ -93,10 +94,25 @@ def test_kernels_of_the_cache_are_loaded_without_what_compiles_others(tmp_path: 
         assert done.returncode == 0, done.stderr
         return done.stdout.splitlines()
 
-    assert call("total") == ["5.0", "True False"]  # compiled, without BLAS
-    assert call("total") == ["5.0", "False False"]
-    assert call("total", "twice") == ["5.0", "10.0", "True False"]  # one from the cache, and one that calls it compiled
-    assert call("twice", "total") == ["10.0", "5.0", "False False"]
+    assert call("total") == ["5.0", "True False True"]  # compiled, without BLAS
+    assert call("total") == ["5.0", "False False False"]  # from the cache, whose bitcode nobody needs
+    # one from the cache, and one that calls it compiled, from its bitcode
+    assert call("total", "twice") == ["5.0", "10.0", "True False True"]
+    assert call("twice", "total") == ["10.0", "5.0", "False False False"]
+
+
+def test_a_command_that_ends_looks_for_no_rubbish() -> None:
+    code = """import atexit, gc
+atexit.register(lambda: print(gc.get_freeze_count() > 1000, gc.isenabled()))  # after what main registers
+from sfmapp.cli.main import main
+for _ in range(2):
+    try:
+        main(["--version"])
+    except SystemExit:
+        print(gc.get_freeze_count())"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert [line for line in done.stdout.splitlines() if not line.startswith("sfmapp")] == ["0", "0", "True True"]
 
 
 @pytest.fixture

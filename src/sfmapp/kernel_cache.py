@@ -70,11 +70,14 @@ def load_numba_sparingly() -> None:
 
     Before it loads the first one numba loads all that any kernel might be compiled with, and scipy.linalg for those
     that call BLAS: together as much time and memory as numba itself. What is compiled already needs none of it. Here
-    numba does so before it first compiles, and always without BLAS, which no kernel of ours calls. The process has to
-    be a command's own; a program that imports sfmapp keeps its numba whole.
+    numba does so before it first compiles, and always without BLAS, which no kernel of ours calls. Of each kernel it
+    also reads the code from which others could inline it, and lists what that defines, half of the time of loading;
+    here only of those that others are compiled with. The process has to be a command's own; a program that imports
+    sfmapp keeps its numba whole.
     """
     from numba.core import environment
     from numba.core.caching import FunctionCache
+    from numba.core.codegen import JITCodeLibrary
     from numba.core.cpu import CPUContext
 
     with _PATCHING:
@@ -82,6 +85,9 @@ def load_numba_sparingly() -> None:
             FunctionCache.load_overload = _load_compiled
             environment._rebuild_env = _environment_alone(environment._rebuild_env)
             CPUContext.load_additional_registries = _without_blas(CPUContext.load_additional_registries)
+            JITCodeLibrary._unserialize = classmethod(_code_alone(JITCodeLibrary._unserialize.__func__))
+            JITCodeLibrary.get_pointer_to_function = _pointer_into_code(JITCodeLibrary.get_pointer_to_function)
+            JITCodeLibrary._get_module_for_linking = _read_when_linked(JITCodeLibrary._get_module_for_linking)
 
 
 def is_ours_alone(folder: Path) -> bool:
@@ -135,6 +141,53 @@ def _environment_alone(rebuild: Callable[..., Any]) -> Callable[..., Any]:
         found.env_name = name
         Environment._memo[name] = found
         return found
+
+    return method
+
+
+def _code_alone(unserialize: Callable[..., Any]) -> Callable[..., Any]:
+    """``_unserialize`` of numba's libraries with the machine code alone; the bitcode beside it stays unread."""
+
+    @wraps(unserialize)
+    def method(library_class: Any, codegen: Any, state: Any) -> Any:
+        name, kind, data = state
+        if kind != "object":
+            return unserialize(library_class, codegen, state)
+        library = codegen.create_library(name)
+        library.enable_object_caching()
+        library._set_compiled_object(data[0])
+        library._finalize_final_module()
+        library._unread = data
+        return library
+
+    return method
+
+
+def _pointer_into_code(find: Callable[..., Any]) -> Callable[..., Any]:
+    """``get_pointer_to_function`` of numba's libraries for those whose bitcode is unread: their own entries are asked
+    for, and an entry that was made has its name among the symbols of the code."""
+
+    @wraps(find)
+    def method(library: Any, name: str) -> Any:
+        if (unread := getattr(library, "_unread", None)) is None:
+            return find(library, name)
+        return library.codegen._engine.get_function_address(name) if name.encode() in unread[0] else 0
+
+    return method
+
+
+def _read_when_linked(module_of: Callable[..., Any]) -> Callable[..., Any]:
+    """``_get_module_for_linking`` of numba's libraries, which reads the bitcode if it was not yet."""
+
+    @wraps(module_of)
+    def method(library: Any) -> Any:
+        if (unread := getattr(library, "_unread", None)) is not None:
+            from numba.core.codegen import ll
+
+            library._shared_module = ll.parse_bitcode(unread[1])
+            library.codegen._engine._load_defined_symbols(library._shared_module)
+            library._unread = None
+        return module_of(library)
 
     return method
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import gc
 import os
@@ -88,7 +89,10 @@ def listening(args: argparse.Namespace) -> Iterator[Events]:
 @contextlib.contextmanager
 def seldom_collecting() -> Iterator[None]:
     """Until a job begins Python loads a hundred thousand objects that are there to stay; looking for rubbish among them
-    each time that there are a few hundred more is a tenth of that time."""
+    each time that there are a few hundred more is a tenth of that time. When the process ends it would look through all
+    of them once more, a third of a second, for memory that the system takes back anyway."""
+    atexit.unregister(gc.freeze)  # a program may run several commands
+    atexit.register(gc.freeze)
     gc.set_threshold(100_000, *_USUAL[1:])
     try:
         yield

@@ -19,6 +19,7 @@ def main() -> None:
 
     if line := sys.stdin.readline():
         draw(*json.loads(line))
+    gc.freeze()  # Python looks for some when it ends, even so
 
 
 def draw(kind: str, folder: str, output: str, threads: int) -> None:
