@@ -102,6 +102,30 @@ def test_with_a_sensor_innovations_and_errors_are_as_stated() -> None:
     assert low < total.mean() / 6 < high
 
 
+def test_a_clock_that_is_off_is_found_out() -> None:
+    """By milliseconds that nobody knows of, a draw of what is expected, innovations and errors are as stated; where the
+    clocks are taken for one they are not."""
+    sigma_s, offsets, nis, naive, errors = 0.004, [], [], [], []
+    for seed, case in enumerate(CASES):
+        offset_s = sigma_s * np.random.default_rng([seed, 12]).normal()
+        late = replace(case.sensor.imu, timestamps_s=case.sensor.imu.timestamps_s + offset_s)
+        found = case.filtered(replace(case.sensor, imu=late, clock_sigma_s=sigma_s))
+        later_s, stated_s = found.clock_s
+        assert stated_s < 0.1 * sigma_s
+        offsets.append((later_s - offset_s) / stated_s)
+        nis.append(found.nis[3:])
+        naive.append(case.filtered(replace(case.sensor, imu=late)).nis[3:])
+        errors.append(case.nees(found, found.frame_row[40::40]))
+    told, total = consistency(np.concatenate(nis)), np.concatenate(errors)
+    assert told is not None
+    assert told.mean_low < told.mean < told.mean_high
+    low, high = chi2.ppf([0.025, 0.975], 6 * len(total)) / (6 * len(total))
+    assert low < total.mean() / 6 < high
+    low, high = chi2.ppf([0.025, 0.975], len(offsets)) / len(offsets)
+    assert low < np.mean(np.square(offsets)) < high
+    assert np.nanmean(np.concatenate(naive)) / 6 > 1.2
+
+
 def test_poses_come_at_the_rate_of_the_sensor_and_are_better_than_measured() -> None:
     gains, raw_errors = [], []
     for case in CASES[:4]:

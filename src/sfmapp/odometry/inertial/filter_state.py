@@ -17,8 +17,11 @@ Cantin, Tardos and Neira, "Robocentric map joining", Robotics and Autonomous Sys
 What an adjustment of the map takes back of the drift says which part of it was drift, and not the sensor's biases; what
 it takes back is told in the world as well, or the filter would carry it along for good.
 
-The error state (37,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, the
-rate of the drift, and what adjustments have not taken back of it.
+The clocks of camera and sensor are apart by what is not known of them: a frame shows where the sensor is a moment later
+(Li and Mourikis, "Online temporal calibration for camera-IMU systems", Int. Journal of Robotics Research 2014).
+
+The error state (38,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, the
+rate of the drift, what adjustments have not taken back of it, and that moment.
 """
 
 from __future__ import annotations
@@ -41,8 +44,8 @@ Array = NDArray[np.float64]
 
 # Where the parts of the error state are.
 _P, _R, _V, _BG, _BA, _G, _CP, _CR = (slice(3 * k, 3 * k + 3) for k in range(8))
-_S, _U, _W = slice(24, 25), slice(25, 31), slice(31, 37)
-_SIZE = 37
+_S, _U, _W, _T = slice(24, 25), slice(25, 31), slice(31, 37), slice(37, 38)
+_SIZE = 38
 _ROWS = np.arange(_SIZE)
 # Gravity is 9.78 to 9.83 m/s^2 from place to place.
 _GRAVITY_SIGMA = 0.02
@@ -73,6 +76,7 @@ class InertialSensor:
             direction.
         gyro_bias, accel_bias: (3,) rad/s and m/s^2, uncertain by what biases of small sensors may be.
         scale_sigma: relative standard deviation of the unit of length of the poses; 0: they are in metres.
+        clock_sigma_s: standard deviation of how far frames are later on the clock of the measurements than they say.
     """
 
     imu: Imu
@@ -81,6 +85,7 @@ class InertialSensor:
     gyro_bias: Array
     accel_bias: Array
     scale_sigma: float = 0.0
+    clock_sigma_s: float = 0.0
 
 
 class Shared(NamedTuple):
@@ -118,6 +123,7 @@ class FilterState:
         # a place x in the world is at scale turn x + shift in the map, whose unit was said to be a metre
         self._shift, self._turn, self._log_scale = np.zeros(3), np.eye(3), 0.0
         self._is_metric = sensor.scale_sigma == 0.0
+        self._later_s, self._turning = 0.0, np.zeros(3)  # frames are, by the sensor's clock; rad/s, of the sensor
         self._rate = np.zeros(6)  # of the drift, a frame: of what is where the camera is, and of the rotation
         # the drift that no adjustment took back, where the camera was; covariance of it and of the rate by poses alone
         self._walked, self._there, self._by_poses = np.zeros(6), np.zeros(3), np.zeros((12, 12))
@@ -129,7 +135,7 @@ class FilterState:
         along = np.outer(down, down)
         tilt = GRAVITY * sensor.gravity_sigma_rad
         self._p[_G, _G] = tilt**2 * (np.eye(3) - along) + _GRAVITY_SIGMA**2 * along
-        self._p[_S, _S] = sensor.scale_sigma**2
+        self._p[_S, _S], self._p[_T, _T] = sensor.scale_sigma**2, sensor.clock_sigma_s**2
         self._prior = self._p.copy()
 
     def copied(self) -> FilterState:
@@ -144,6 +150,11 @@ class FilterState:
         return float(np.sqrt(self._p[24, 24]))
 
     @property
+    def clock_s(self) -> tuple[float, float]:
+        """How much later frames are on the clock of the measurements than they say, and its standard deviation."""
+        return self._later_s, float(np.sqrt(self._p[37, 37]))
+
+    @property
     def tilt_sigma_rad(self) -> float:
         """Standard deviation of the direction of gravity, about the axis of which it is the largest."""
         size = float(np.linalg.norm(self._gravity))
@@ -152,25 +163,26 @@ class FilterState:
 
     # ---- the map
 
-    def begin(self, center: Array, rotation: Array, noise: Array, shared: Shared) -> None:
-        """At a pose of the camera (centre, world_from_cam and their covariance), with any velocity. The world is that
-        of the map as it is now."""
-        self._rotation = rotation @ self._imu_from_cam.T
+    def begin(self, center: Array, rotation: Array, noise: Array, shared: Shared, turning: Array) -> None:
+        """At a pose of the camera (centre, world_from_cam and their covariance), with any velocity, where the gyroscope
+        says turning (3,). The world is that of the map as it is now."""
+        self._turning, self._velocity = turning - self.gyro_bias, np.zeros(3)
+        self._rotation = rotation @ self._imu_from_cam.T @ rigid3.exp_so3(-self._later_s * self._turning)
         self._position = center - math.exp(self._log_scale) * self._rotation @ self._arm
-        self._velocity, self._behind, self._rate = np.zeros(3), center, np.zeros(6)
-        known = np.r_[_BG, _BA, _G, _S]
+        self._behind, self._rate = center, np.zeros(6)
+        known = np.r_[_BG, _BA, _G, _S, _T]
         kept = self._p[np.ix_(known, known)]
         self._p[:] = 0.0
         self._p[np.ix_(known, known)] = kept
         h = self._measurement()
         back = np.linalg.inv(h[:, :6])
         self._p[:6, :6] = back @ (shared.white * noise) @ back.T
-        # the camera is there whatever the unit of length is
-        self._p[_P], self._p[:, _P] = (
-            self._p[_P] - h[:3, _S] @ self._p[_S],
-            self._p[:, _P] - self._p[:, _S] @ h[:3, _S].T,
-        )
-        self._p[_P, _P] += h[:3, _S] @ self._p[_S, _S] @ h[:3, _S].T
+        # the camera is there whatever the unit of length and the clocks are
+        h[:3, _T] = 0.0
+        change = np.eye(_SIZE)
+        for told in (_S, _T):
+            change[:6, told] = -back @ h[:, told]
+        self._p = change @ self._p @ change.T
         in_map = np.eye(6)
         in_map[3:, 3:] = rotation
         self._last_noise = in_map @ noise @ in_map.T
@@ -283,7 +295,7 @@ class FilterState:
         self._change_unit(shared, noise, center)
 
     def _moved_with_map(self) -> Array:
-        """(37, 6) slopes of the state by the map: how far it moves where the camera is, and how it turns about that."""
+        """(38, 6) slopes of the state by the map: how far it moves where the camera is, and how it turns about that."""
         here, spread = self._center(), np.zeros((_SIZE, 6))
         spread[_P, :3] = spread[_CP, :3] = np.eye(3)
         spread[_P, 3:], spread[_CP, 3:] = -rigid3.skew(self._position - here), -rigid3.skew(self._shift - here)
@@ -334,6 +346,7 @@ class FilterState:
         faster = size * (h * self._gravity + r @ velocity)
         farther = size * (0.5 * h * h * self._gravity + r @ moved)
         turn, f, in_map = delta[:9].reshape(3, 3), np.eye(_SIZE), size * r
+        self._turning = step[1:4] - self.gyro_bias
         f[_P, _R], f[_V, _R] = -in_map @ rigid3.skew(moved), -in_map @ rigid3.skew(velocity)
         f[_R, _R], f[_R, _BG] = turn.T, slope[0]
         f[_V, _BG], f[_V, _BA] = in_map @ slope[1], in_map @ slope[2]
@@ -358,19 +371,31 @@ class FilterState:
         center: Array = self._position + math.exp(self._log_scale) * self._rotation @ self._arm
         return center
 
+    def _seen(self) -> tuple[Array, Array]:
+        """Centre (3,) and rotation map_from_cam (3, 3) of what a frame of this time shows."""
+        later = self._rotation @ rigid3.exp_so3(self._later_s * self._turning) @ self._imu_from_cam
+        return self._center() + self._later_s * self._camera_velocity(), later
+
+    def _camera_velocity(self) -> Array:
+        """(3,) in the map."""
+        about: Array = self._rotation @ np.cross(self._turning, self._arm)
+        return self._velocity + math.exp(self._log_scale) * about
+
     def _measurement(self) -> Array:
-        """(6, 37) slopes of the camera's centre in the map and of its rotation, in its own frame."""
+        """(6, 38) slopes of the camera's centre in the map and of its rotation, in its own frame."""
         h, size = np.zeros((6, _SIZE)), math.exp(self._log_scale)
         h[:3, _P], h[:3, _R] = np.eye(3), -size * self._rotation @ rigid3.skew(self._arm)
         h[:3, 24] = size * self._rotation @ self._arm
         h[3:, _R] = self._imu_from_cam.T
+        h[:3, 37], h[3:, 37] = self._camera_velocity(), self._imu_from_cam.T @ self._turning
+        h[:3, _V] = self._later_s * np.eye(3)
         return h
 
     def camera(self) -> tuple[Array, Array, Array]:
         """Rotation world_from_cam (3, 3), centre in the world (3,) and their covariance (6, 6), centre first."""
         back, size = self._turn.T, math.exp(-self._log_scale)
-        in_map = self._rotation @ self._imu_from_cam
-        ahead = self._center() - self._shift
+        center, in_map = self._seen()
+        ahead = center - self._shift
         change = self._measurement()
         change[:3, _CP], change[:3, _CR] = -np.eye(3), rigid3.skew(ahead)
         change[:3, 24] -= ahead
@@ -380,8 +405,8 @@ class FilterState:
 
     def innovation(self, center: Array, rotation: Array) -> Array:
         """(6,) what a measured pose says beyond the state."""
-        ours = self._rotation @ self._imu_from_cam
-        return np.concatenate([center - self._center(), rigid3.log_so3(ours.T @ rotation)])
+        here, ours = self._seen()
+        return np.concatenate([center - here, rigid3.log_so3(ours.T @ rotation)])
 
     def whitened(self, innovation: Array, noise: Array) -> Array:
         """(6,) the innovation without the correlations that it should have, in standard deviations."""
@@ -394,7 +419,7 @@ class FilterState:
         self._update(innovation, self._measurement(), noise)
 
     def _update(self, innovation: Array, h: Array, noise: Array) -> None:
-        """By a measurement of slopes h (6, 37)."""
+        """By a measurement of slopes h (6, 38)."""
         gain = np.linalg.solve(h @ self._p @ h.T + noise, h @ self._p).T
         step, keep = gain @ innovation, np.eye(_SIZE) - gain @ h
         self._p = keep @ self._p @ keep.T + gain @ noise @ gain.T
@@ -406,7 +431,7 @@ class FilterState:
         turn = rigid3.exp_so3(step[_CR])
         self._turn, self._shift = turn @ self._turn, self._shift + step[_CP]
         self._log_scale, self._rate = self._log_scale + float(step[24]), self._rate + step[_U]
-        self._walked = self._walked + step[_W]
+        self._walked, self._later_s = self._walked + step[_W], self._later_s + float(step[37])
 
     def forget(self, innovation: Array) -> None:
         """The poses jumped, and go on from there: the map did. What carries a camera moves steadily between the samples

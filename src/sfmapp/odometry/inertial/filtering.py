@@ -70,6 +70,8 @@ class FilteredTrajectory:
         is_rejected: (F,) bool: the pose disagreed with the motion and was not used.
         prediction: ``imu`` or ``constant velocity``.
         gyro_bias, accel_bias: (3,) in the end; zeros without a sensor.
+        clock_s: how much later frames are on the clock of the measurements than they say, and its standard deviation,
+            in the end; zeros as above.
         latency_s: (N,) seconds on the clock that finding a row took, after its sample or pose was there.
         widening: (N,) factor that is in the covariance, as innovations of the last frames were larger than they should
             be; 1 where they were not.
@@ -87,6 +89,7 @@ class FilteredTrajectory:
     prediction: str
     gyro_bias: Array
     accel_bias: Array
+    clock_s: tuple[float, float]
     latency_s: Array
     widening: Array
 
@@ -231,7 +234,7 @@ def _at_constant_velocity(
     return FilteredTrajectory(
         times[rows], found.cam_from_world[rows], found.covariance[rows], since, found.is_predicted[rows], frame_row,
         np.full((len(times), 6), np.nan), found.nis, found.is_rejected, "constant velocity", np.zeros(3), np.zeros(3),
-        np.full(len(rows), spent / max(len(rows), 1)), np.ones(len(rows)),
+        (0.0, 0.0), np.full(len(rows), spent / max(len(rows), 1)), np.ones(len(rows)),
     )  # fmt: skip
 
 
@@ -361,12 +364,13 @@ class InertialFilter:
             rows[:, 0], rows[:, 1:8], rows[:, 8:44].reshape(-1, 6, 6), rows[:, 44], rows[:, 45] == 1.0,
             np.array(self._frame_row, np.int64), innovation, (innovation**2).sum(1),
             np.array(self._is_rejected, bool), "imu",
-            state.gyro_bias, state.accel_bias, rows[:, 46], rows[:, 47],
+            state.gyro_bias, state.accel_bias, state.clock_s, rows[:, 46], rows[:, 47],
         )  # fmt: skip
 
     def _begin_at(self, timestamp_s: float, pose: tuple[Array, Array, Array], shared: Shared, begin: float) -> None:
         state = self._start.copied()
-        state.begin(*pose, shared)
+        turning = self._value(timestamp_s)[:3] if self._samples else state.gyro_bias
+        state.begin(*pose, shared, turning)
         self._used_s, self._in_a_row, self._is_waiting = timestamp_s, 0, False
         self._hold(state, timestamp_s)
         self._note_frame(state, timestamp_s, False, begin)
