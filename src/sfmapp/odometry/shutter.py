@@ -37,9 +37,10 @@ from sfmapp.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 
 # Steps, as shares of the time between frames, in which the least cost is looked for, first far and then near, until it
-# has settled: the motion is known the better the straighter its images are. No camera reads longer than one frame; one
-# that reads from the bottom up is mounted upside down.
-_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.005, 1.0
+# has settled: the motion is known the better the straighter its images are. It has where the next change, were it as
+# much smaller as the last one was, would move nothing by a tenth of a pixel that moves by 20 from frame to frame. No
+# camera reads longer than one frame; one that reads from the bottom up is mounted upside down.
+_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.01, 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
 # What a gyroscope has to explain beyond the frames: as much as errors of patches, which are not independent, make of
@@ -59,7 +60,8 @@ def straighten(
 ) -> ShutterReport:
     """Find the readout of the camera of a map, and move what its frames saw to where a global shutter had seen it.
 
-    Where that is worth it, the map is adjusted, and observations and poses are changed in place. Else nothing is.
+    Where that is worth it, the map is adjusted, and observations and keyframes are changed in place; the frames between
+    them are to be measured again. Else nothing is.
 
     Args:
         imu: measured beside the frames; None where there is none, or where it is not to count.
@@ -67,13 +69,13 @@ def straighten(
     Returns:
         The numbers behind the decision.
     """
-    total, first = 0.0, (0.0, 0.0)
+    total, last, first = 0.0, 0.0, (0.0, 0.0)
     source: Imu | None = None
     for n, stride in enumerate(_STRIDES):
         is_first = n == 0
-        found = _search(_RowShift(records, keyframes, map_idx, source), keyframes, stride, is_first)
+        found = _search(_RowShift(records, keyframes, map_idx, source), keyframes, stride, last)
         if is_first and imu is not None:
-            turned = _search(_RowShift(records, keyframes, map_idx, imu), keyframes, stride, is_first)
+            turned = _search(_RowShift(records, keyframes, map_idx, imu), keyframes, stride, last)
             if turned[1] > found[1] + _CLEAR:
                 found, source = turned, imu
         readout, evidence, job = found
@@ -87,17 +89,20 @@ def straighten(
         _move(records, keyframes, map_idx, _RowShift(records, keyframes, map_idx, source), readout)
         classify(job.model, job.num_elsewhere)
         take_over(job, keyframes)
-        measure_again(records, keyframes, map_idx)
-        if abs(readout) < _SETTLED:
+        if last and readout**2 < _SETTLED * abs(last):
             break
+        measure_again(records, keyframes, map_idx)
+        last = readout
     return ShutterReport(evidence=first[0], min_evidence=MIN_EVIDENCE, first_readout=first[1], readout=total)
 
 
-def _search(
-    shift_of: _RowShift, keyframes: KeyframeMap, stride: float, is_first: bool
-) -> tuple[float, float, Job | None]:
+def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float, last: float) -> tuple[float, float, Job | None]:
     """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
-    where there is no least cost within reach, or costs that are no numbers; or, the first time, no sign of one."""
+    where there is no least cost within reach, or costs that are no numbers; or, the first time, no sign of one.
+
+    Args:
+        last: what was found the time before, in whose direction the least cost is looked for first; 0 the first time.
+    """
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, tracks = job.model, job.model.tracks
@@ -108,11 +113,15 @@ def _search(
     if not shifts.any():
         return 0.0, 0.0, None
     sigma = residual_scale_px(model, MIN_SIGMA_PX)
-    if is_first:
+    towards = 1 if last > 0 else -1
+    if last == 0:
         glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
         if not np.isfinite(glance).all() or abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
             return 0.0, 0.0, None
-    costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (-1, 0, 1)}
+        towards = 1 if glance[2] < glance[0] else -1
+    costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (0, towards)}
+    if not costs[towards] < costs[0]:
+        costs[-towards] = _adjusted(job, shifts, -towards * stride, sigma)[0]
     best = min(costs, key=lambda n: (costs[n], abs(n)))
     while {best - 1, best + 1} - set(costs) and abs(best) * stride <= _MAX_READOUT:
         beyond = best + (1 if best > 0 else -1)

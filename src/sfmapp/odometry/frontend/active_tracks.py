@@ -175,8 +175,9 @@ def align_to_references(
         (N, 2) pixels, (N,) likeness, (N,) which alignments have converged.
     """
     xy, zncc, found = guess.copy(), np.zeros(len(tracks), np.float32), np.zeros(len(tracks), bool)
-    for keyframe in np.unique(tracks.reference):
-        mine = np.flatnonzero(tracks.reference == keyframe)
+    keyframes, counts = np.unique(tracks.reference, return_counts=True)
+    by_keyframe = np.split(np.argsort(tracks.reference, kind="stable"), np.cumsum(counts)[:-1])
+    for keyframe, mine in zip(keyframes, by_keyframe, strict=False):  # without tracks there is a part all the same
         aligned = align_patches(
             images[int(keyframe)], tracks.reference_xy[mine], pyramid, guess[mine], affine=warp[mine],
             coarsest_level=coarsest_level,
