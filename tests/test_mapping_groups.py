@@ -12,7 +12,7 @@ from sfmapp.adjust.options import AdjustOptions
 from sfmapp.camera.camera import CameraModel, simple_camera
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
-from sfmapp.mapping import repair, structure
+from sfmapp.mapping import join, repair, structure
 from sfmapp.mapping.incremental import map_images
 from sfmapp.mapping.join import find_joint
 from sfmapp.mapping.mapper import Mapper
@@ -250,3 +250,8 @@ def test_many_matches_under_a_small_angle_start_before_few_under_a_wide_one():
     started = model.registered_idx.tolist()
     assert len(started) == 2
     assert started != found.pair_image_idx[far].tolist()
+
+
+def test_a_scale_that_nothing_tells_ends_no_search() -> None:
+    step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e4])
+    assert np.isinf(join._moved(similarity.from_parts(np.eye(3), np.zeros(3), 1.0), step)[7])

@@ -501,7 +501,8 @@ def _robust_cost(residuals: Array, tolerance_px: float) -> float:
 def _moved(sim: Array, step: Array) -> Array:
     """A similarity changed by a turn, a shift and a log of scale, in the world of the target."""
     rotation = rigid3.exp_so3(step[:3]) @ rigid3.rotation_matrix(sim)
-    return similarity.from_parts(rotation, sim[4:7] + step[3:6], float(sim[7] * math.exp(step[6])))
+    with np.errstate(over="ignore"):  # a scale that nothing tells may go anywhere: infinity is no better than before
+        return similarity.from_parts(rotation, sim[4:7] + step[3:6], float(sim[7] * np.exp(step[6])))
 
 
 def _residuals(sim: Array, checks: _Checks) -> Array:

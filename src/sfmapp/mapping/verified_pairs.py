@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.lens import undistort, unproject
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
-from sfmapp.mapping import near_views
+from sfmapp.mapping import near_views, pair_motions
 from sfmapp.mapping.report import NamedPair
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.correspondences import Correspondences
@@ -227,8 +227,8 @@ class Chains:
 
 
 def contradictions_of(models: Sequence[Reconstruction], correspondences: Correspondences) -> list[list[Contradiction]]:
-    """For each model the pairs that stand against it: pairs inside it, pairs that lead out of it, and pairs
-    that should have matches and have none.
+    """For each model the pairs that stand against it: pairs inside it, pairs that lead out of it, pairs that should
+    have matches and have none, and pairs with relative poses of their own.
 
     Args:
         models: over the same tracks, the largest first.
@@ -240,9 +240,8 @@ def contradictions_of(models: Sequence[Reconstruction], correspondences: Corresp
         for m, other in enumerate(models):
             if m > n:
                 of_model += _between(model, other, correspondences, m)
-        found.append(
-            of_model + _left_out(model, models, correspondences) + near_views.contradiction_of(model, correspondences)
-        )
+        of_model += _left_out(model, models, correspondences) + near_views.contradiction_of(model, correspondences)
+        found.append(of_model + pair_motions.contradiction_of(model, correspondences))
     return found
 
 

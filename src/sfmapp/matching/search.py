@@ -28,6 +28,9 @@ _CONFIDENCE = 0.999
 # Of such samples some lead to models that miss many of the right matches: so many times as many are drawn before a
 # model that explains enough is given up.
 _SPARE = 2.0
+# A relative pose at the noise of its matches is within so many of their standard deviations, as usual, measured so many
+# times at most, as a bent pose is twice as far from them; and once more only where that is less than so much of before.
+_NOISE_SIGMAS, _NOISE_ROUNDS, _SAME_NOISE = 3.0, 2, 0.9
 # Matches that leave the eight numbers of a plane open by less than a tenth of their noise.
 _MANY = 1000
 
@@ -243,3 +246,32 @@ def best_relative_pose(essentials: Array, pool: Ints, xn1: Array, xn2: Array, th
     if math.sqrt(float(squared[inlier].mean())) < HEAVY_TAILS * sigma:
         return best
     return refine_relative_pose(best, xn1[inlier], xn2[inlier], CAUCHY_SIGMAS * sigma)
+
+
+def relative_pose_at_noise(essentials: Array, xn1: Array, xn2: Array, threshold: float) -> Array | None:
+    """:func:`best_relative_pose` of all matches, at the threshold and then as near to them as their noise lets it be.
+
+    The threshold of verification is several times the noise of good keypoints. Where views have little parallax, a
+    pose that also comes within it of the matches of one thing taken for its like bends all others by a little, which
+    costs less than to leave those out, though the right pose has most of the others four times as near.
+
+    Args:
+        essentials: (K, 3, 3) candidates. xn1, xn2: (N, 2) normalised image points, or (N, 3) unit rays, of which most
+            are right. threshold: largest Sampson distance of an inlier, in their units.
+
+    Returns:
+        (7,) pose with unit translation, or None.
+    """
+    everything = np.arange(len(xn1))
+    pose = best_relative_pose(essentials, everything, xn1, xn2, threshold)
+    limit = threshold
+    for _ in range(_NOISE_ROUNDS):
+        if pose is None:
+            break
+        essential = epipolar.essential_from_pose(pose)
+        sigma = robust_sigma(epipolar.sampson_errors(essential, xn1, xn2), 1)
+        before, limit = limit, max(_NOISE_SIGMAS * sigma, 1e-3 * threshold)
+        if limit > _SAME_NOISE * before:
+            break
+        pose = best_relative_pose(np.concatenate([essentials, essential[None]]), everything, xn1, xn2, limit)
+    return pose
