@@ -23,7 +23,8 @@ Ints = NDArray[np.int64]
 # rest. Nothing hangs on it closely.
 LARGEST_PART = 150
 # Fewer verified matches prove no geometry of a pair, and of two images that have others with ten times as many matches
-# a pair says nothing that these do not: it is left to the model of all.
+# a pair says nothing that these do not: it is left to the model of all. So is an image in a part of which another part
+# has ten times as many matches: with so few it comes to a place by chance, and drags the others along.
 _MIN_MATCHES, _MIN_SHARE = 30, 0.1
 # The smaller half has this share of the images at least.
 _MIN_HALF = 0.3
@@ -35,8 +36,9 @@ _MAX_SEPARATOR, _FEWEST_SHARED = 0.75, 6
 def divide(num_images: int, pair_image_idx: NDArray[np.integer], num_matches: NDArray[np.integer]) -> list[Ints]:
     """Parts of a match graph, for each the positions of its images, ascending; the parts by their first images.
 
-    Every link (:func:`links`) is inside a part, and each part is connected by links. Images without any are in no part,
-    as are groups that are too small to be mapped. A set that has no good cut is a part as it is, whatever its size.
+    Every link (:func:`links`) is inside a part, but for those of an image whose other links another part has, and each
+    part is connected by links. Images without any are in no part, as are groups that are too small to be mapped. A set
+    that has no good cut is a part as it is, whatever its size.
 
     Args:
         num_images: I.
@@ -53,7 +55,7 @@ def divide(num_images: int, pair_image_idx: NDArray[np.integer], num_matches: ND
             parts.append(members)
         else:
             waiting += halves
-    return [np.array(part, np.int64) for part in sorted(_without_contained(parts))]
+    return [np.array(part, np.int64) for part in sorted(graph.without_loose(_without_contained(parts)))]
 
 
 def links(num_images: int, pair_image_idx: NDArray[np.integer], num_matches: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -123,6 +125,20 @@ class _Graph:
             return None
         return [sorted(side | separator) for side in (first, second)]
 
+    def without_loose(self, parts: list[list[int]]) -> list[list[int]]:
+        """The parts without images of which another one has many times the matches, where they hang together so."""
+        held = [{i: self._tie(i, set(part)) for i in part} for part in parts]
+        most: dict[int, int] = {}
+        for ties in held:
+            for i, tie in ties.items():
+                most[i] = max(most.get(i, 0), tie)
+        firm = [[i for i, tie in ties.items() if tie >= _MIN_SHARE * most[i]] for ties in held]
+        return [kept if len(self.components(kept)) == 1 else part for kept, part in zip(firm, parts, strict=True)]
+
+    def _tie(self, i: int, inside: set[int]) -> int:
+        """Matches of an image with those of a set."""
+        return sum(w for j, w in self._edges(i) if j in inside)
+
     def _ends(self, members: list[int]) -> list[int]:
         """Members at the ends of the graph: two that are far from each other, and one far from both."""
         inside = set(members)
@@ -149,7 +165,7 @@ class _Graph:
         total, cut, taken = len(inside), 0, set[int]()
         order: list[int] = []
         tied = dict.fromkeys(inside, 0)
-        degree = {i: sum(w for j, w in self._edges(i) if j in inside) for i in inside}
+        degree = {i: self._tie(i, inside) for i in inside}
         heap = [(degree[seed], seed)]
         best = (np.inf, 0)
         while heap:
