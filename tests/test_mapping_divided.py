@@ -282,9 +282,11 @@ def test_the_page_tells_parts_and_seams(in_parts) -> None:
         names = " and ".join(f"{n}: {report.parts.submaps[n].first_image} ..." for n in seam.submaps)
         rows = [text for text in page.split("<tr>") if names in text]
         assert len(rows) == 1
-        assert ("red" in rows[0]) == bool(seam.reason)
+        light = "green" if not seam.reason else "grey" if seam.num_images < 3 else "red"
+        assert f'"t {light}"' in rows[0]
         assert f"{seam.num_points_agreeing} of {seam.num_points}" in rows[0] or not seam.num_points
     assert "as a whole" not in page
+    assert "nan" not in page
     failed = FailedPartReport(first_image="a<b.jpg", num_images=17, reason="ValueError: x > y")
     page = parts_section(replace(report.parts, failed=[failed], given_up="they bend"))
     assert "a&lt;b.jpg ..." in page
@@ -546,7 +548,7 @@ def test_submaps_that_fold_or_share_too_little_have_no_seam() -> None:
     folded = [submaps[0], Submap(submaps[1].part, half_off), submaps[2]]
     first, second = find_seams(folded, mapper_of, MappingOptions())
     assert first.reason
-    assert "share 2 images" in second.reason
+    assert "share 2 of the 3 images" in second.reason
     worlds, _ = assemble(folded, [first, second])
     assert [world.members for world in worlds] == [[0], [1], [2]]
 

@@ -248,7 +248,8 @@ def joined(
         seams=[
             SeamReport(
                 submaps=list(seam.submaps), num_images=len(seam.image_idx), num_elsewhere=int(seam.is_off.sum()),
-                num_points=seam.num_points, num_points_agreeing=seam.num_seen, sigmas=seam.sigmas, reason=seam.reason,
+                num_points=seam.num_points, num_points_agreeing=seam.num_seen, reason=seam.reason,
+                sigmas=seam.sigmas if np.isfinite(seam.sigmas) else None,
             )
             for seam in seams
         ],

@@ -100,7 +100,7 @@ def find_common(first: int, second: int, submaps: Sequence[Submap], options: Map
     nothing = np.zeros(0, np.int64)
     found = Common((first, second), images, tracks, nothing, np.full(8, np.nan))
     if len(images) < MIN_SHARED:
-        return replace(found, reason=f"they share {len(images)} images, at least {MIN_SHARED} are needed")
+        return replace(found, reason=f"they share {len(images)} of the {MIN_SHARED} images that are needed")
     start = find_merge(*(_only(submap, images, tracks) for submap in (a, b)))
     if start is None:
         return replace(found, reason=f"{len(tracks)} points of both do not agree on one scale")

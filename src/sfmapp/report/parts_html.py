@@ -13,6 +13,8 @@ _ABOUT = (
     "are held against each other in these, and what agrees is adjusted as one model. Images of a part that is left out "
     "are registered one by one from where their neighbours are."
 )
+# Two images hold a similarity, and only more could tell that it is wrong.
+_ENOUGH_TO_DISAGREE = 3
 
 
 def parts_section(report: PartsReport) -> str:
@@ -49,8 +51,11 @@ def _seams(seams: Sequence[SeamReport], submaps: Sequence[SubmapReport]) -> str:
     rows = []
     for seam in seams:
         names = " and ".join(f"{n}: {submaps[n].first_image} ..." for n in seam.submaps)
+        light = "red" if seam.reason else "green"
+        if seam.reason and seam.num_images < _ENOUGH_TO_DISAGREE:
+            light = "grey"
         rows.append([
-            ("t red" if seam.reason else "t green", names), ("", seam.num_images), ("", seam.num_elsewhere or None),
+            (f"t {light}", names), ("", seam.num_images), ("", seam.num_elsewhere or None),
             ("", f"{seam.num_points_agreeing} of {seam.num_points}" if seam.num_points else None),
             ("", None if seam.sigmas is None else f"{seam.sigmas:.2f}"), ("w", seam.reason),
         ])  # fmt: skip
