@@ -1,15 +1,18 @@
-"""Large adjustments: batches, products by rows, the envelope, threads, progress. Small scenes stand in for large."""
+"""Large adjustments: batches, products by rows, envelope, fronts, threads, progress. Small scenes stand for large."""
 
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from sfmapp.adjust import progress, solver
+from sfmapp.adjust import front_system as front_system_module
+from sfmapp.adjust import linear, progress, solver
 from sfmapp.adjust.covariance import reduced_matrix
 from sfmapp.adjust.elimination import GROUP
-from sfmapp.adjust.envelope import EnvelopeSystem
-from sfmapp.adjust.linear import choose_solver, prefers_rounds
+from sfmapp.adjust.envelope import EnvelopeOrder, EnvelopeSystem
+from sfmapp.adjust.front_system import FrontSystem, best_order
+from sfmapp.adjust.fronts import FrontOrder
+from sfmapp.adjust.linear import choose_solver, may_suit_fronts, prefers_rounds
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import Varying
 from sfmapp.adjust.solver import adjust_bundle, make_engine
@@ -66,10 +69,15 @@ def test_a_step_is_that_of_the_normal_equations_however_points_are_batched(monke
     monkeypatch.setattr(solver, "_BATCH_ENTRIES", batch)
     model = start_of(make_scene(2, 5, 24))
     system, gradient = normal_equations(model, 1e-3)
-    for name in ("tiles", "envelope"):
-        monkeypatch.setattr(solver, "choose_solver", lambda *_, name=name, **__: name)
+    for name in ("tiles", "envelope", "fronts"):
+        chosen = "envelope" if name == "fronts" else name
+        monkeypatch.setattr(solver, "choose_solver", lambda *_, chosen=chosen, **__: chosen)
         monkeypatch.setattr(solver, "_MAX_DENSE_BLOCKS", 0)
+        if name == "fronts":
+            monkeypatch.setattr(front_system_module, "may_suit_fronts", lambda *_: True)
+            monkeypatch.setattr(front_system_module, "prefers_fronts", lambda *_: True)
         engine = make_engine(model, OPTIONS)
+        assert engine.solver == name
         assert (len(engine.limits) > 2) == (batch == 40)
         engine.linearize(1e-3, map)
         step = engine.solve().reshape(-1, 8)[np.arange(8) < engine.problem.block_dim[:, None]]
@@ -96,18 +104,29 @@ def random_system(rng, num, met):
     return dims, keys, tiles.ravel(), matrix
 
 
-@pytest.mark.parametrize("kind", ["loop", "scattered", "full", "apart", "one"])
-def test_an_envelope_solves_systems_of_any_pattern(kind):
+def envelope_system(dims, keys):
+    return EnvelopeSystem(dims, keys, np.arange(len(keys)))
+
+
+def front_system(dims, keys):
+    return FrontSystem(dims, keys, np.arange(len(keys)), FrontOrder(len(dims), *np.divmod(keys, len(dims))))
+
+
+@pytest.mark.parametrize("system_of", [envelope_system, front_system])
+@pytest.mark.parametrize("kind", ["loop", "scattered", "full", "apart", "one", "plane"])
+def test_factors_of_large_systems_solve_those_of_any_pattern(monkeypatch, kind, system_of):
+    monkeypatch.setattr(front_system_module, "_ROWS", 16)  # several tasks of a front
     rng = np.random.default_rng(0)
     num = 1 if kind == "one" else 90
-    apart = np.abs(np.arange(num)[:, None] - np.arange(num))
+    apart, places = np.abs(np.arange(num)[:, None] - np.arange(num)), rng.random((num, 2))
     met = {
         "loop": np.minimum(apart, num - apart) < 5, "scattered": rng.random((num, num)) < 0.03,
         "full": apart >= 0, "apart": apart < 0, "one": apart >= 0,
+        "plane": np.linalg.norm(places[:, None] - places, axis=2) < 0.16,
     }[kind]  # fmt: skip
     met[:, -1] |= kind == "loop"  # a camera that all share
     dims, keys, tiles, matrix = random_system(rng, num, met)
-    system = EnvelopeSystem(dims, keys, np.arange(len(keys)))
+    system = system_of(dims, keys)
     used = np.arange(8) < dims[:, None]
     right = rng.normal(size=(num, 8))
     found = system.solve(tiles, right.ravel()).reshape(-1, 8)
@@ -115,13 +134,30 @@ def test_an_envelope_solves_systems_of_any_pattern(kind):
     assert not found[~used].any()
     with ThreadPoolExecutor(3) as pool:
         assert (system.solve(tiles, right.ravel(), pool.map).reshape(-1, 8) == found).all()
-    if kind == "loop":  # both ways round at once, beside the last rows
+    if kind == "loop" and system_of is envelope_system:  # both ways round at once, beside the last rows
         full = EnvelopeSystem(dims, np.flatnonzero(np.triu(np.ones((num, num)))), np.arange(num * (num + 1) // 2))
         assert system.order.flops < 0.6 * full.order.flops
     # an indefinite system is told
     place = int(np.flatnonzero(keys == (num - 1) * (num + 1))[0]) * 64
     tiles[place] = -1.0
     assert system.solve(tiles, right.ravel()) is None
+
+
+def test_fronts_factor_what_lies_in_a_plane_and_envelopes_a_room(monkeypatch):
+    assert may_suit_fronts(0.03, 1e11)
+    assert not may_suit_fronts(0.03, 1e9)  # their order would take longer than what it saves
+    assert not may_suit_fronts(0.6, 1e12)
+    monkeypatch.setattr(linear, "_DEAR_FLOPS", 0.0)
+    rng = np.random.default_rng(1)
+    num = 900
+    places = rng.random((num, 2))
+    kinds = {"plane": np.linalg.norm(places[:, None] - places, axis=2) < 0.1, "room": rng.random((num, num)) < 0.6}
+    for kind, met in kinds.items():
+        dims = np.full(num, 6)
+        a, b = np.nonzero(np.triu(met | met.T))
+        order, flops = best_order(dims, a, b, 2 * len(a) / num**2)
+        assert isinstance(order, FrontOrder) == (kind == "plane")
+        assert flops <= EnvelopeOrder(dims, a, b).flops / (1.5 if kind == "plane" else 1.0)
 
 
 def test_threads_and_batches_change_nothing(monkeypatch):

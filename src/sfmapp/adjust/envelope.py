@@ -26,7 +26,7 @@ _WIDE, _NARROW, _WIDE_ROWS = 192, 96, 1500
 # A block that meets more than this share of all is put last: all others would follow it otherwise.
 _MEETS_MOST = 0.5
 # What rounding leaves of a zero pivot, against the diagonal before.
-_NO_PIVOT = 1e-14
+NO_PIVOT = 1e-14
 
 
 class EnvelopeOrder:
@@ -134,7 +134,7 @@ class EnvelopeSystem:
     def factor(self, tiles: Array, run: Callable[..., Any] = map) -> bool:
         """Factor the system in tiles (N * 64,); False where it is not positive definite."""
         num = len(self._panels)
-        list(run(lambda i: _gather(tiles, self._places[i], self._panels[i]), range(num)))
+        list(run(lambda i: gather_panel(tiles, self._places[i], self._panels[i]), range(num)))
         diagonal = [panel[:, -len(panel) :].diagonal().copy() for panel in self._panels]
         for k in range(num):
             below = [i for i in range(k + 1, num) if self.order.first[i] <= k]
@@ -176,7 +176,7 @@ class EnvelopeSystem:
             factor = np.linalg.cholesky(block)
         except np.linalg.LinAlgError:
             return False
-        if not (factor.diagonal() ** 2 > _NO_PIVOT * diagonal).all():
+        if not (factor.diagonal() ** 2 > NO_PIVOT * diagonal).all():
             return False
         self._inverse[k] = np.ascontiguousarray(dtrtri(factor, lower=1)[0])
         return True
@@ -203,7 +203,7 @@ class EnvelopeSystem:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(tiles: Array, places: Ints, panel: Array) -> None:
+def gather_panel(tiles: Array, places: Ints, panel: Array) -> None:
     """Fill a panel from its tiles; places (M, 6) are number of the tile, row and column in the panel, how many of them,
     and whether the tile is turned there."""
     panel[:] = 0.0

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from sfmapp.adjust.elimination import COLUMNS
 from sfmapp.adjust.envelope import EnvelopeSystem
+from sfmapp.adjust.front_system import FrontSystem
 from sfmapp.adjust.gauge import StepsInGauge
 from sfmapp.adjust.kernels import ImageArrays, LensArrays, Meetings
 from sfmapp.simd.pointers import pointer
@@ -50,7 +51,7 @@ class IterativeSystem:
         num_rounds: that the last step took.
     """
 
-    def __init__(self, block_dim: Ints, near: EnvelopeSystem, held_rounds: int = 0) -> None:
+    def __init__(self, block_dim: Ints, near: EnvelopeSystem | FrontSystem, held_rounds: int = 0) -> None:
         """near: of clusters, to be factored in each step. held_rounds: or of the whole, whose factor is held for as
         long as a step takes no more rounds."""
         self._near, self._held_rounds = near, held_rounds

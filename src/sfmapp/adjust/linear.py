@@ -19,7 +19,7 @@ from sfmapp.simd.f64x8 import assign8, subtract8
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SolverName = Literal["tiles", "gtsam", "lapack", "envelope", "iterative"]
+SolverName = Literal["tiles", "gtsam", "lapack", "envelope", "fronts", "iterative"]
 
 # Measured by benchmarks/reduced_systems.py; fill is the share of pairs of blocks that meet. Up to 400 unknowns, some
 # 65 poses, LAPACK is as quick as gtsam at any fill, for so few poses fill much of their system when they are eliminated
@@ -32,6 +32,9 @@ _FEW_BLOCKS = 160
 # block of a point in a round of conjugate gradients; and rounds of a step. Inexact steps are more: rounds must be
 # quicker by so many times.
 _FLOP_S, _PRODUCT_S, _ENTRY_S, _ROUNDS, _CLEARLY = 1 / 45e9, 12e-9, 12e-9, 40, 2.0
+# An envelope that costs so much is held against fronts, whose order takes a tenth of a second for 1,000 blocks; their
+# products are smaller, and less of them is: they must save this factor.
+_DEAR_FLOPS, _FRONTS_SAVE = 1e10, 1.5
 # Poses that gtsam eliminates together.
 _GROUP = 6
 # What rounding leaves of a zero pivot, against the diagonal before.
@@ -55,6 +58,16 @@ def choose_solver(num_blocks: int, num_unknowns: int, fill: float, *, is_closing
     if is_closing:
         return "gtsam" if may_suit_gtsam(num_blocks, num_unknowns) and is_sparse(fill) else "lapack"
     return "tiles"
+
+
+def may_suit_fronts(fill: float, flops: float) -> bool:
+    """Whether fronts may be quicker than an envelope whose factor costs so much."""
+    return is_sparse(fill) and flops > _DEAR_FLOPS
+
+
+def prefers_fronts(flops_of_fronts: float, flops_of_envelope: float) -> bool:
+    """Whether fronts are quicker."""
+    return _FRONTS_SAVE * flops_of_fronts < flops_of_envelope
 
 
 def prefers_rounds(num_entries: int, num_products: int, flops: float) -> bool:

@@ -108,9 +108,9 @@ class AdjustReport(Report):
             graph with ``noise_px``, square standard deviations.
         num_images, num_cameras, num_points, num_observations: what took part; images and cameras only if they vary.
         num_unknowns: of the reduced system, in which most points are eliminated.
-        solver: of the reduced system: ``tiles`` (ours), ``envelope`` (ours, of large ones), ``iterative`` (of large and
-            full ones, never made), ``gtsam`` (sparse) or ``lapack`` (dense); ``none`` where gtsam adjusted the plain
-            graph, one factor per observation.
+        solver: of the reduced system: ``tiles`` (ours), ``envelope`` (ours, of large ones), ``fronts`` (ours, of large
+            sparse ones), ``iterative`` (of large and full ones, never made), ``gtsam`` (sparse) or ``lapack`` (dense);
+            ``none`` where gtsam adjusted the plain graph, one factor per observation.
         fill: share of the pairs of unknown blocks that meet in a point or a factor.
         noise_px: standard deviation of a pixel coordinate that the factors were weighed with.
         factors: what each kind of factor came to.

@@ -92,7 +92,7 @@ def covariance_of_functions(engine: Engine, rows: Array) -> Array | None:
     """
     used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
     wanted, none = rows[:, used], np.zeros((0, int(used.sum())))
-    if engine.solver == "gtsam" or (engine.solver == "envelope" and is_sparse(engine.fill)):
+    if engine.solver in ("gtsam", "fronts") or (engine.solver == "envelope" and is_sparse(engine.fill)):
         engine.linearize(0.0, map)
         matrix = _sparse_system(engine, used)
         root = 1.0 / np.sqrt(matrix.diagonal())

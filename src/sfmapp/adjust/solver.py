@@ -239,15 +239,18 @@ class Engine:
             self.fill = 2 * len(keys) / (blocks * (blocks + 1))
             self.solver = choose_solver(blocks, int(p.block_dim.sum()), self.fill, is_closing=is_closing)
         if self.solver == "envelope":
-            from sfmapp.adjust.envelope import EnvelopeOrder, EnvelopeSystem  # loads scipy
+            from sfmapp.adjust.front_system import best_order, factored_by  # loads scipy
+            from sfmapp.adjust.fronts import FrontOrder
             from sfmapp.adjust.iterative import IterativeSystem, is_of_cluster
 
-            order = EnvelopeOrder(p.block_dim, *np.divmod(keys, blocks))
-            cost = len(self.meetings.block), int(products.sum()), order.flops
+            order, flops = best_order(p.block_dim, *np.divmod(keys, blocks), self.fill)
+            cost = len(self.meetings.block), int(products.sum()), flops
             may_iterate = may_iterate and self.extras is None
             if may_iterate and prefers_rounds(*cost):
                 self.solver, order = "iterative", None
                 keys = keys[is_of_cluster(*np.divmod(keys, blocks))]
+            elif isinstance(order, FrontOrder):
+                self.solver = "fronts"
         self.has_all_tiles = is_small or self.solver == "tiles"
         self.tile_keys = np.arange(blocks * blocks) if self.has_all_tiles else keys
         numbers = keys if self.has_all_tiles else np.arange(len(keys))
@@ -259,8 +262,9 @@ class Engine:
             self.system = SparseSystem(p, keys, numbers, self.extras.block_keys() if self.extras else [])
         elif self.solver == "lapack":
             self.system = LapackSystem(p.block_dim, keys, numbers)
-        elif self.solver in ("envelope", "iterative"):
-            self.system = near = EnvelopeSystem(p.block_dim, keys, numbers, order)
+        elif self.solver in ("envelope", "fronts", "iterative"):
+            near = factored_by(order, p.block_dim, keys, numbers)
+            self.system = near
             if self.solver == "iterative":
                 self.iterative = IterativeSystem(p.block_dim, near)
             elif may_iterate and cost[0] <= _HELD_ENTRIES:
@@ -307,7 +311,7 @@ class Engine:
 
     def lone(self) -> AbstractContextManager[Any]:
         """A context in which LAPACK has one thread, if it is asked: with more its bytes would depend on how many."""
-        return one_blas_thread() if self.solver in ("lapack", "envelope", "iterative") else nullcontext()
+        return one_blas_thread() if self.solver in ("lapack", "envelope", "fronts", "iterative") else nullcontext()
 
     def linearize(self, damping: float, run: Callable[..., Any]) -> float:
         """Reduced system at the current state with damped points; returns the cost of the state.

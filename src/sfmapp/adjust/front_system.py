@@ -1,0 +1,206 @@
+"""The Cholesky factor of large sparse reduced systems by fronts, on all threads.
+
+Where images meet few others, in all directions, as those of a town do, rows have no order that keeps them short: the
+envelope of a part of the plane with B blocks costs B^2, fronts B^1.5 (George 1973). Subtrees of fronts that cost alike
+are done by one thread each, in an order that keeps little waiting; the few fronts above them, which are large, by all
+threads in rows. Every number is made in an order that depends on the system alone: the bytes are those of one thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sfmapp.adjust.envelope import NO_PIVOT, EnvelopeOrder, EnvelopeSystem, gather_panel
+from sfmapp.adjust.fronts import FrontOrder
+from sfmapp.adjust.linear import may_suit_fronts, prefers_fronts
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Subtrees cost at most this share of all each, and rows of large products are taken so many at a time.
+_SUBTREE, _ROWS = 1 / 24, 192
+
+
+class FrontSystem:
+    """The factor in fronts.
+
+    Args of solve as of :class:`~sfmapp.adjust.linear.TileSystem`; keys (N,) a B + b and numbers (N,) say which tiles
+    there are, ``run`` maps tasks on threads.
+    """
+
+    def __init__(self, block_dim: Ints, keys: Ints, numbers: Ints, order: FrontOrder) -> None:
+        self._dim, self._order = block_dim, order
+        dims = block_dim[np.argsort(order.position)]
+        self._at = (np.cumsum(dims) - dims)[order.position]  # first unknown of each block, as they are eliminated
+        self._unknowns = [_spread(self._at[blocks], block_dim[blocks]) for blocks in order.blocks]
+        self._num_own = [
+            int(block_dim[blocks[:own]].sum()) for blocks, own in zip(order.blocks, order.num_own, strict=True)
+        ]
+        self._places = self._places_of_tiles(*np.divmod(keys, len(block_dim)), numbers)
+        self._children: list[list[int]] = [[] for _ in order.blocks]
+        self._at_parent: list[Ints] = []
+        for f, parent in enumerate(order.parent.tolist()):
+            left = self._unknowns[f][self._num_own[f] :]
+            self._at_parent.append(np.searchsorted(self._unknowns[parent], left) if parent >= 0 else left)
+            if parent >= 0:
+                self._children[parent].append(f)
+        self._subtrees, self._above = _parted(order.parent, flops_of_fronts(order, block_dim))
+        self._left: list[Array | None] = [None] * len(order.blocks)
+        self._inverse = [np.zeros((0, 0))] * len(order.blocks)
+        self._below = [np.zeros((0, 0))] * len(order.blocks)
+
+    def _places_of_tiles(self, a: Ints, b: Ints, numbers: Ints) -> list[Ints]:
+        """Where the tiles (a, b) of each front go in its own columns, as of :func:`gather_panel`."""
+        position, dim = self._order.position, self._dim
+        is_turned = position[a] <= position[b]  # tiles have a before b, columns are of what is eliminated first
+        high, low = np.where(is_turned, b, a), np.where(is_turned, a, b)
+        front = np.repeat(np.arange(len(self._num_own)), self._order.num_own)[position[low]]
+        sort = np.argsort(front, kind="stable")
+        ends = np.searchsorted(front[sort], np.arange(len(self._num_own) + 1))
+        out = []
+        for f, unknowns in enumerate(self._unknowns):
+            here = sort[ends[f] : ends[f + 1]]
+            row, column = (np.searchsorted(unknowns, self._at[block[here]]) for block in (high, low))
+            places = [numbers[here], row, column, dim[high[here]], dim[low[here]], is_turned[here]]
+            out.append(np.stack(places, 1).astype(np.int64))
+        return out
+
+    def solve(self, tiles: Array, rhs: Array, run: Callable[..., Any] = map) -> Array | None:
+        """Solution (B * 8,) of the damped system in tiles (N * 64,), None where it is not positive definite."""
+        return self.substitute(rhs) if self.factor(tiles, run) else None
+
+    def factor(self, tiles: Array, run: Callable[..., Any] = map) -> bool:
+        """Factor the system in tiles (N * 64,); False where it is not positive definite."""
+        self._left = [None] * len(self._left)
+
+        def subtree(fronts: range) -> bool:
+            return all(self._eliminate(f, tiles, map) for f in fronts)
+
+        return all(list(run(subtree, self._subtrees))) and all(self._eliminate(f, tiles, run) for f in self._above)
+
+    def _eliminate(self, f: int, tiles: Array, run: Callable[..., Any]) -> bool:
+        """Factor the own columns of a front, and keep what it leaves to the one above; False where there is no
+        factor."""
+        from scipy.linalg.lapack import dtrtri
+
+        k, size = self._num_own[f], len(self._unknowns[f])
+        own, rest = np.zeros((size, k)), np.zeros((size - k, size - k))
+        gather_panel(tiles, self._places[f], own)
+        diagonal = own.diagonal().copy()
+        for child in self._children[f]:
+            left = self._left[child]
+            assert left is not None
+            _add_left(left, self._at_parent[child], own, rest)
+            self._left[child] = None
+        try:
+            factor = np.linalg.cholesky(own[:k])
+        except np.linalg.LinAlgError:
+            return False
+        if not (factor.diagonal() ** 2 > NO_PIVOT * diagonal).all():
+            return False
+        inverse = np.ascontiguousarray(dtrtri(factor, lower=1)[0])
+        below = np.empty((size - k, k))
+
+        def substituted(i: int) -> None:
+            below[i : i + _ROWS] = own[k + i : k + i + _ROWS] @ inverse.T
+
+        def subtracted(i: int) -> None:
+            j = min(i + _ROWS, size - k)
+            rest[i:j, :j] -= below[i:j] @ below[:j].T  # the lower half is all that is used
+
+        rows = range(0, size - k, _ROWS)
+        list(run(substituted, rows))
+        list(run(subtracted, rows))
+        self._inverse[f], self._below[f], self._left[f] = inverse, below, rest
+        return True
+
+    def substitute(self, rhs: Array) -> Array:
+        """Solution (B * 8,) for a right-hand side (B * 8,), with the factor."""
+        used = np.arange(8) < self._dim[:, None]
+        at = (self._at[:, None] + np.arange(8))[used]
+        x = np.empty(len(at))
+        x[at] = rhs.reshape(-1, 8)[used]
+        fronts = [
+            (slice(unknowns[0], unknowns[0] + k), unknowns[k:], inverse, below)
+            for unknowns, k, inverse, below in zip(
+                self._unknowns, self._num_own, self._inverse, self._below, strict=True
+            )
+        ]
+        for own, behind, inverse, below in fronts:
+            x[own] = inverse @ x[own]
+            x[behind] -= below @ x[own]
+        for own, behind, inverse, below in reversed(fronts):
+            x[own] = inverse.T @ (x[own] - below.T @ x[behind])
+        step = np.zeros((len(self._dim), 8))
+        step[used] = x[at]
+        return step.ravel()
+
+
+def best_order(block_dim: Ints, a: Ints, b: Ints, fill: float) -> tuple[EnvelopeOrder | FrontOrder, float]:
+    """What factors a large system the quicker, and how many multiplications and additions that takes.
+
+    Args:
+        block_dim: (B,) unknowns of each block. a, b: (N,) blocks a <= b that meet. fill: share of all that do.
+    """
+    envelope = EnvelopeOrder(block_dim, a, b)
+    if may_suit_fronts(fill, envelope.flops):
+        fronts = FrontOrder(len(block_dim), a, b)
+        flops = float(flops_of_fronts(fronts, block_dim).sum())
+        if prefers_fronts(flops, envelope.flops):
+            return fronts, flops
+    return envelope, envelope.flops
+
+
+def factored_by(
+    order: EnvelopeOrder | FrontOrder | None, block_dim: Ints, keys: Ints, numbers: Ints
+) -> EnvelopeSystem | FrontSystem:
+    """The system that an order of :func:`best_order` is of, or in the best envelope; arguments as of these."""
+    if isinstance(order, FrontOrder):
+        return FrontSystem(block_dim, keys, numbers, order)
+    return EnvelopeSystem(block_dim, keys, numbers, order)
+
+
+def flops_of_fronts(order: FrontOrder, block_dim: Ints) -> Array:
+    """(F,) multiplications and additions of each front."""
+    size = np.array([block_dim[blocks].sum() for blocks in order.blocks], np.float64)
+    own = np.array([block_dim[blocks[:n]].sum() for blocks, n in zip(order.blocks, order.num_own, strict=True)])
+    rest = size - own
+    flops: Array = own * (4.0 / 3.0 * own**2 + 2.0 * own * rest + rest**2)
+    return flops
+
+
+def _spread(start: Ints, length: Ints) -> Ints:
+    """Numbers from each start on, so many of each."""
+    first = np.cumsum(length) - length
+    return (np.repeat(start - first, length) + np.arange(int(length.sum()))).astype(np.int64)
+
+
+def _parted(parent: Ints, flops: Array) -> tuple[list[range], list[int]]:
+    """Subtrees of fronts, from the first to the last of each, and the fronts above them all; parents are behind their
+    children."""
+    total, first = flops.copy(), np.arange(len(parent))
+    for f, p in enumerate(parent.tolist()):
+        if p >= 0:
+            total[p] += total[f]
+            first[p] = min(first[p], first[f])
+    is_above = total > _SUBTREE * flops.sum()
+    roots = [f for f, p in enumerate(parent.tolist()) if not is_above[f] and (p < 0 or is_above[p])]
+    return [range(int(first[f]), f + 1) for f in roots], np.flatnonzero(is_above).tolist()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_left(left: Array, at: Ints, own: Array, rest: Array) -> None:
+    """Add the lower half of what a front has left to the one above it, in whose unknowns it is at (N,), ascending."""
+    k = own.shape[1]
+    for i in range(left.shape[0]):
+        row = at[i]
+        for j in range(i + 1):
+            if at[j] < k:
+                own[row, at[j]] += left[i, j]
+            else:
+                rest[row - k, at[j] - k] += left[i, j]
