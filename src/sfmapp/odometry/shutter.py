@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 
 # Steps, as shares of the time between frames, in which the least cost is looked for, first far and then near, until it
 # has settled: the motion is known the better the straighter its images are. It has where the next change, were it as
-# much smaller as the last one was, would move nothing by a tenth of a pixel that moves by 20 from frame to frame. No
-# camera reads longer than one frame; one that reads from the bottom up is mounted upside down.
-_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.01, 1.0
+# much smaller as the last one was, would move nothing by 0.05 pixels that moves by 20 from frame to frame. No camera
+# reads longer than one frame; one that reads from the bottom up is mounted upside down.
+_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.005, 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
 # What a gyroscope has to explain beyond the frames: as much as errors of patches, which are not independent, make of
