@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.register import register_image
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene, true_correspondences
+from sfmapp.scene.tracks import make_tracks
 
 WORLD = np.append(rigid3.from_matrix(rigid3.exp_so3(np.array([0.4, -1.1, 0.3])), [5.0, -2.0, 1.0]), 2.5)
 
@@ -255,3 +257,28 @@ def test_many_matches_under_a_small_angle_start_before_few_under_a_wide_one():
 def test_a_scale_that_nothing_tells_ends_no_search() -> None:
     step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e4])
     assert np.isinf(join._moved(similarity.from_parts(np.eye(3), np.zeros(3), 1.0), step)[7])
+
+
+def test_a_scale_that_a_few_points_alone_tell_is_not_believed() -> None:
+    """All but five common points are seen by one image of the one model, which stays where it is at any scale."""
+    place = make_place(0, 2, points=300, overlap=0.2)
+    with ThreadPoolExecutor(1) as pool:
+        target, source = halves(place, pool)
+    assert find_joint(target, source, place.correspondences, MappingOptions()).reason == ""
+    tracks = source.tracks
+    of_source = source.is_registered[tracks.obs_image_idx]
+    seen = [
+        np.bincount(tracks.obs_track_idx[side], minlength=tracks.num_tracks) > 0 for side in (of_source, ~of_source)
+    ]
+    common = np.flatnonzero(seen[0] & seen[1])
+    bridge = np.bincount(tracks.obs_image_idx[of_source & np.isin(tracks.obs_track_idx, common)]).argmax()
+    gone = of_source & (tracks.obs_image_idx != bridge) & np.isin(tracks.obs_track_idx, common[5:])
+    source.point_xyz[common[5:]] = np.nan
+    fewer = make_tracks(
+        tracks.num_images, tracks.num_tracks, tracks.obs_track_idx[~gone], tracks.obs_image_idx[~gone],
+        tracks.obs_feature_idx[~gone], tracks.obs_xy[~gone],
+    )  # fmt: skip
+    models = [replace(model, tracks=fewer, obs_is_inlier=model.obs_is_inlier[~gone]) for model in (target, source)]
+    joint = find_joint(*models, place.correspondences, MappingOptions())
+    assert "nothing tells the scale between them" in joint.reason
+    assert joint.num_agreeing > 0.6 * joint.num_links

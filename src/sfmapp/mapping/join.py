@@ -49,6 +49,9 @@ NUM_REFINED = 3
 MIN_LINK_SHARE = 0.4
 # Truncated squared error of a link that agrees, of 1 at most.
 AGREEING_COST = 0.5
+# Where so large a share of the links that agree does so at another scale as well, nothing tells the scale: the models
+# meet in a camera that turned on the spot. Of a rendered film all did, and the scale was found 10 times too large.
+UNTOLD_SHARE, OTHER_SCALES = 0.95, (0.8, 1.25)
 # Share of the matches which agree with each model that must still do so in the union: a wrong one is torn.
 MIN_KEPT = 0.95
 
@@ -144,6 +147,7 @@ def find_joint(
     else:
         agrees = _agrees(refined[chosen], checks, tolerance_px)
         reason = _seen_from_behind(target, source, correspondences, checks.link_tracks[agrees])
+        reason = reason or _at_another_scale(refined[chosen], num_agreeing, checks, (target, source), tolerance_px)
     return Joint(refined[chosen], checks.num_links, num_agreeing, reason)
 
 
@@ -362,6 +366,28 @@ def _seen_from_behind(
     if total and kept / total < 0.5 - 0.5 / math.sqrt(points):
         return f"the one is seen mirrored by the other: {kept} of {total} triangles of common points keep their side"
     return ""
+
+
+def _at_another_scale(
+    sim: Array, num_agreeing: int, checks: _Checks, models: tuple[Reconstruction, Reconstruction], tolerance_px: float
+) -> str:
+    """Why the scale of a similarity from source to target is not to be trusted; empty if links tell it.
+
+    Scaled about the centre of an image, what that image sees stays where it is.
+    """
+    target, source = models
+    others = []
+    for image_idx in _bridges(checks):
+        if target.is_registered[image_idx]:
+            center = target.centers[image_idx]
+        else:
+            center = sim[7] * rigid3.rotation_matrix(sim[:7]) @ source.centers[image_idx] + sim[4:7]
+        for factor in OTHER_SCALES:
+            others.append(np.concatenate([sim[:4], center + factor * (sim[4:7] - center), [factor * sim[7]]]))
+    most, change = int(_scores(np.array(others), checks, tolerance_px)[1].max()), round(100 - 100 * OTHER_SCALES[0])
+    if most < UNTOLD_SHARE * num_agreeing:
+        return ""
+    return f"nothing tells the scale between them: {most} of {num_agreeing} common points agree at one {change} % off"
 
 
 # ----------------------------------------------------------------- hypotheses

@@ -124,12 +124,15 @@ def _motion(model: Reconstruction, correspondences: Correspondences, pair_idx: i
     in_model[4:] /= length
     essential = epipolar.essential_from_pose(in_model)
     by_model = epipolar.sampson_errors(essential, x1, x2)
+    # twice the tolerance of verification: pairs that are off by more are told by verified_pairs, or overruled there
+    threshold = error_threshold_px(*cameras, MatchingOptions()) / (cameras[0].focal + cameras[1].focal)
+    if np.median(by_model) > (4.0 * threshold) ** 2:
+        return None
     fundamental = correspondences.fundamental[pair_idx]
     if np.isfinite(fundamental).all():
         by_f = epipolar.sampson_errors(cameras[1].k_matrix.T @ fundamental @ cameras[0].k_matrix, x1, x2)
         if np.median(by_model) <= _LOOKED_AT**2 * np.median(by_f):
             return _Motion(pair_idx, len(x1), 0.0, 0.0, 0.0)
-    threshold = error_threshold_px(*cameras, MatchingOptions()) / (cameras[0].focal + cameras[1].focal)
     candidates = np.concatenate([essential[None], essentials_of_samples(x1, x2, Ransac(0, 0))])
     own = relative_pose_at_noise(candidates, x1, x2, threshold)
     if own is None:
