@@ -23,7 +23,7 @@ from sfmapp.errors import NoReconstructionError
 from sfmapp.events import Events
 from sfmapp.executor import Threads
 from sfmapp.images.folder import ImageSet
-from sfmapp.mapping import verified_pairs
+from sfmapp.mapping import pair_motions, verified_pairs
 from sfmapp.mapping.carry import carried
 from sfmapp.mapping.closing_move import closing_move, widened_by_move
 from sfmapp.mapping.divided import Divided, InParts, PartsWork
@@ -244,6 +244,8 @@ def _model_report(
     """What a finished model says; contradictions that were found among the verified pairs widen its uncertainty."""
     summary = model.summary()  # as it was grown: what follows may lean on priors
     uncertainty, contradictions = check_intrinsics(mapped, model, map_all, events)
+    if contradictions:  # wrong intrinsics bend a map: what they do to it is told and in its sigmas
+        found = [contradiction for contradiction in found if contradiction.subject != pair_motions.SUBJECT]
     for contradiction in found:
         events.warned(STAGE, contradiction.message, **contradiction.evidence)
         uncertainty = widened_uncertainty(

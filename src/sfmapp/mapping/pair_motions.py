@@ -28,6 +28,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 
+SUBJECT = "relative poses of pairs"
+
 # Pairs of fewer matches are left out, and of the others those with most of them are enough to tell.
 _MIN_MATCHES, _MOST_PAIRS = 45, 100
 # A pair is looked at closely where its matches are so many times as far from the model as from its own F, which has
@@ -83,7 +85,7 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
     )
     return [
         Contradiction(
-            "relative poses of pairs",
+            SUBJECT,
             message,
             "things that look alike may have been confused, or views with little parallax bent the model: add "
             "photographs from farther apart, or give a calibration",
