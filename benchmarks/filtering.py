@@ -55,7 +55,7 @@ FPS = 20.0
 _FIRST = 5
 # Those before were looked at while the filter was made, and so were the ones named here.
 FIRST_FLIGHT = 20
-CHOSE = (20, 21, 22, 24, 26, 28, *range(100, 109), 110)
+CHOSE = (20, 21, 22, 24, 26, 28, *range(100, 109), *range(110, 114))
 FIRST_SMALL = 100
 
 

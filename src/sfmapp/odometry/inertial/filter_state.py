@@ -21,7 +21,7 @@ The clocks of camera and sensor are apart by what is not known of them: a frame 
 (Li and Mourikis, "Online temporal calibration for camera-IMU systems", Int. Journal of Robotics Research 2014).
 
 The error state (38,): position, rotation R exp(dtheta), velocity, biases, gravity, shift c, exp(dphi) C, log s, the
-rate of the drift, what adjustments have not taken back of it, and that moment.
+rate of the drift, what adjustments may yet take back of it, and that moment.
 """
 
 from __future__ import annotations
@@ -58,9 +58,12 @@ _LEAST_PARALLAX = math.radians(1.0)
 # correlated the more there is of it.
 _STEPS = 0.5
 # What an adjustment takes back of the variance of the drift, at most: successive ones take back the same thing in part.
-# By six rendered flights (20, 21, 22, 26, 103, 108), on which errors are 0.4 to 1.3 of their covariances with it and up
-# to three times that with 0.4 (on four of them). Below a thousandth it tells nothing.
-_MOST_TAKEN, _LEAST_TAKEN = 0.15, 1e-3
+# What drifted long ago no adjustment of the newest keyframes takes back any more: it goes out of reach at this part of
+# the rate at which points are lost. Without that the heading was believed to be known ever better, which nothing but
+# the map tells. By flights 111, 112 and 113 of those of benchmarks/filtering.py, on which errors are 1.3 to 2.4 of
+# their covariances; with 0.15 and nothing out of reach, which others had chosen, 2.5 to 7.3. Below a thousandth it
+# tells nothing.
+_MOST_TAKEN, _LEAST_TAKEN, _OUT_OF_REACH = 0.08, 1e-3, 0.05
 # Where more is taken back than can have drifted of late, chi-squared of six beyond what one in a million is, it is of a
 # loop or of a wrong first map, and counts the less the more it is.
 _MOST_SQUARES = 38.3
@@ -125,7 +128,7 @@ class FilterState:
         self._is_metric = sensor.scale_sigma == 0.0
         self._later_s, self._turning = 0.0, np.zeros(3)  # frames are, by the sensor's clock; rad/s, of the sensor
         self._rate = np.zeros(6)  # of the drift, a frame: of what is where the camera is, and of the rotation
-        # the drift that no adjustment took back, where the camera was; covariance of it and of the rate by poses alone
+        # the drift that may yet be taken back, where the camera was; covariance of it and of the rate by poses alone
         self._walked, self._there, self._by_poses = np.zeros(6), np.zeros(3), np.zeros((12, 12))
         self._num_taken, self._share_taken = 0, 0.0
         self._last_noise: Array | None = None  # (6, 6) of the last pose, in the axes of the map
@@ -278,6 +281,7 @@ class FilterState:
         step[_U, _U] = kept * np.eye(6)
         farther = np.eye(6)
         farther[:3, 3:] = -rigid3.skew(here - self._there)
+        farther *= max(0.0, 1.0 - _OUT_OF_REACH * shared.walk)  # of old drift less and less can be taken back
         step[_W, _W], self._there = farther, here
         self._p = step @ self._p @ step.T + spread @ walked @ spread.T
         both = np.r_[_W, _U]
