@@ -136,6 +136,15 @@ def test_the_order_of_the_points_is_in_no_byte() -> None:
     np.testing.assert_array_equal(one.faces, two.faces)
 
 
+def test_how_bricks_are_shared_is_in_no_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz = ball(9000) * (1.0 + 0.01 * np.random.default_rng(0).normal(size=(9000, 1)))
+    alone = poisson.poisson(xyz, ball(9000).astype(np.float32), 7)
+    monkeypatch.setattr(bricks, "PART", 50)
+    shared = poisson.poisson(xyz, ball(9000).astype(np.float32), 7, threads=3)
+    np.testing.assert_array_equal(shared.xyz, alone.xyz)
+    np.testing.assert_array_equal(shared.faces, alone.faces)
+
+
 def test_noise_is_averaged_and_its_mean_is_not_shifted() -> None:
     rng = np.random.default_rng(1)
     count, depth = 60_000, 6
@@ -237,6 +246,6 @@ def density_on_plane(number: float, angle: float, offset: float, rng: np.random.
     density = np.zeros(len(points), np.float32)
     poisson_kernels.find_densities(
         points, np.ones(len(points), np.bool_), here.codes, here.first, 0, bricks.bricks_around(here.codes),
-        counts, density,
+        counts, density, 0, len(here.codes),
     )  # fmt: skip
     return float(np.mean(density[np.abs(flat[order]).max(axis=1) < 17.0]))

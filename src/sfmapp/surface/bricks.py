@@ -8,6 +8,7 @@ do the samples in each brick of any level once they are in the order of the fine
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.events import Events
+from sfmapp.executor import Threads
 from sfmapp.geometry.morton import gather_bits, spread_bits
 
 Codes = NDArray[np.int64]
@@ -24,7 +26,17 @@ Values = NDArray[np.float32]
 Points = NDArray[np.float32]
 
 SIDE = 4  # nodes; kernels have its powers of two written out
+# bricks that a thread is given at a time: 4 MB of values, and few enough that what lies beside them, which some work is
+# done for once more, is a few percent
+PART = 1 << 14
 COARSEST_DEPTH = 5  # the coarsest level fills the box: 32 cells a side
+
+
+def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None:
+    """Do some work for all of so many bricks: threads call it with the first of a part and what comes behind it."""
+    parts = [(low, min(low + PART, count)) for low in range(0, count, PART)]
+    for _ in Threads(threads).run(lambda part: work(*part), parts):
+        pass
 
 
 @dataclass(frozen=True)

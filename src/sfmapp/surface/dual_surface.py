@@ -11,7 +11,7 @@ vertex.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import numba
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sfmapp.events import Events
 from sfmapp.geometry.cube_cases import EDGES, surface_loops
-from sfmapp.surface.bricks import Codes, Flags, Ids, Level, Values, load_window, place_of
+from sfmapp.surface.bricks import Codes, Flags, Ids, Level, Values, in_parts, load_window, place_of
 
 Array = NDArray[np.float64]
 
@@ -71,13 +71,14 @@ def _table() -> _Table:
 
 
 def dual_surface(
-    levels: Sequence[Level], values: Sequence[Values], events: Events | None = None
+    levels: Sequence[Level], values: Sequence[Values], events: Events | None = None, threads: int = 1
 ) -> tuple[Array, Ids]:  # fmt: skip
     """The surface between negative and other values.
 
     Args:
         levels: the grids, finest first.
         values: (B, 64) of the nodes of each.
+        threads: that share the bricks; the surface does not depend on their number.
 
     Returns:
         Vertices (V, 3) in finest cells from the box's lowest corner on, and triangles (F, 3), anticlockwise as seen
@@ -90,7 +91,10 @@ def dual_surface(
         vertex, counts = np.full((len(level.codes), 64), -1, np.int16), np.zeros(len(level.codes), np.int64)
         is_simple = np.zeros(len(level.codes), np.bool_)
         _find_simple(level.around, level.child, is_simple)
-        _number_vertices(level.is_leaf, level.around, level.child, is_simple, mine, table.num, counts, vertex)
+        number = partial(
+            _number_vertices, level.is_leaf, level.around, level.child, is_simple, mine, table.num, counts, vertex
+        )
+        in_parts(number, len(counts), threads)
         begin = total + np.concatenate([[0], np.cumsum(counts)])
         total = int(begin[-1])
         cells.append(
@@ -99,11 +103,14 @@ def dual_surface(
     xyz, found = np.empty((total, 3)), []
     for n, (level, here) in enumerate(zip(levels, cells, strict=True)):
         events.raise_if_cancelled()
-        _place_vertices(here, table, float(1 << n), xyz)
+        in_parts(partial(_place_vertices, here, table, float(1 << n), xyz), len(here.codes), threads)
         above = cells[min(n + 1, len(cells) - 1)]
-        has_above, none = np.bool_(n + 1 < len(cells)), np.empty((0, 4), np.int32)
-        quads = np.empty((_join_vertices(here, level.parent, above, has_above, level.num, table, none), 4), np.int32)
-        _join_vertices(here, level.parent, above, has_above, level.num, table, quads)
+        joined = (here, level.parent, above, np.bool_(n + 1 < len(cells)), level.num, table)
+        begin = np.zeros(len(here.codes) + 1, np.int64)
+        in_parts(partial(_join_vertices, *joined, begin, np.empty((0, 4), np.int32)), len(here.codes), threads)
+        np.cumsum(begin, out=begin)
+        quads = np.empty((int(begin[-1]), 4), np.int32)
+        in_parts(partial(_join_vertices, *joined, begin, quads), len(here.codes), threads)
         found.append(quads)
     del cells
     quads = np.concatenate(found)
@@ -134,11 +141,11 @@ def _case_of(window: Array, x: int, y: int, z: int) -> int:
 @numba.njit(cache=True, nogil=True)
 def _number_vertices(
     is_leaf: Flags, around: Ids, child: Ids, is_simple: Flags, values: Values, num: NDArray[np.int8], counts: Codes,
-    vertex: NDArray[np.int16],
+    vertex: NDArray[np.int16], low: int, high: int,
 ) -> None:  # fmt: skip
-    """Number the vertices of each brick, as in :class:`_Cells`, and count them (B,)."""
+    """Number the vertices of each brick from one to before another, as in :class:`_Cells`, and count them (B,)."""
     window = np.empty((7, 7, 7))
-    for b in range(is_leaf.shape[0]):
+    for b in range(low, high):
         if not is_leaf[b]:
             continue
         load_window(values, around, b, window, np.nan)
@@ -181,11 +188,11 @@ def _crossing(before: float, start: float, end: float, after: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _place_vertices(cells: _Cells, table: _Table, scale: float, xyz: Array) -> None:
-    """Write the places of the vertices of a level, each amid its crossings."""
+def _place_vertices(cells: _Cells, table: _Table, scale: float, xyz: Array, low: int, high: int) -> None:
+    """Write the places of the vertices of bricks from one to before another, each amid its crossings."""
     window, place = np.empty((7, 7, 7)), np.empty(3, np.int64)
     total, count, at = np.empty((4, 3)), np.empty(4, np.int64), np.empty(3, np.int64)
-    for b in range(cells.codes.shape[0]):
+    for b in range(low, high):
         if not cells.is_leaf[b] or cells.vertex[b].max() < 0:
             continue
         place_of(cells.codes[b], place)
@@ -284,11 +291,16 @@ def _vertices_around(
 
 @numba.njit(cache=True, nogil=True)
 def _join_vertices(
-    cells: _Cells, parent: Ids, above: _Cells, has_above: np.bool_, num: int, table: _Table, quads: Ids
-) -> int:  # fmt: skip
-    """Fill quads (Q, 4) of vertices, -1 for the last of a triangle, or count them if there is no room for any."""
-    count, place, corner, found = 0, np.empty(3, np.int64), np.empty(3, np.int64), np.empty(4, np.int64)
-    for b in range(cells.codes.shape[0]):
+    cells: _Cells, parent: Ids, above: _Cells, has_above: np.bool_, num: int, table: _Table, begin: Codes, quads: Ids,
+    low: int, high: int,
+) -> None:  # fmt: skip
+    """Write vertices of quads (Q, 4) of bricks from one to before another, -1 for the last of a triangle.
+
+    Where those of each brick begin (B + 1,) is given or, if there is no room for any, their number is noted behind it.
+    """
+    place, corner, found = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(4, np.int64)
+    for b in range(low, high):
+        count = begin[b] if quads.shape[0] else 0
         place_of(cells.codes[b], place)
         for n in range(64):
             start = cells.values[b, n] < 0.0
@@ -320,7 +332,8 @@ def _join_vertices(
                     if not start:
                         quads[count, 0], quads[count, 2] = quads[count, 2], quads[count, 0]
                 count += 1
-    return count
+        if not quads.shape[0]:
+            begin[b + 1] = count
 
 
 @numba.njit(cache=True, nogil=True)

@@ -42,7 +42,7 @@ def make_mesh(
         size: (N,) what a pixel measures at each patch, world units.
         scene: the views; what none of them can show is cut off. None: no such trimming.
         options: depth and trimming.
-        threads: workers of the searches; the result does not depend on their number.
+        threads: that share the work; the result does not depend on their number.
         events: progress and cancellation.
 
     Returns:
@@ -58,7 +58,7 @@ def make_mesh(
     patches = make_patch_cloud(xyz, normal, rgb, size, threads)
     depth = options.depth or depth_for(xyz, patches.median_spacing)
     events.advanced(STAGE, message=f"Poisson, depth {depth}")
-    surface = poisson(xyz, normal, depth, events, stage=STAGE)
+    surface = poisson(xyz, normal, depth, events, threads=threads, stage=STAGE)
     events.advanced(STAGE, message="trimming")
     around = look_around(surface.xyz, vertex_normals(surface.xyz, surface.faces), patches, threads)
     events.advanced(STAGE)
@@ -115,6 +115,9 @@ def _trim(
 
 def _cut(xyz: NDArray[np.float64], faces: NDArray[np.int32], around: Surroundings, kept: NDArray[np.bool_]) -> Mesh:
     """The kept faces (F,) with the vertices they need."""
-    used, corners = np.unique(faces[kept], return_inverse=True)
-    kept_faces = corners.reshape(-1, 3).astype(np.int32)
-    return Mesh(xyz[used], kept_faces, vertex_normals(xyz[used], kept_faces), around.rgb[used])
+    faces = faces[kept]
+    is_used = np.zeros(len(xyz), np.bool_)
+    is_used[faces] = True
+    faces = (np.cumsum(is_used, dtype=np.int32) - np.int32(1))[faces]
+    xyz = xyz[is_used]
+    return Mesh(xyz, faces, vertex_normals(xyz, faces), around.rgb[is_used])

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,12 @@ from sfmapp.reporting import Usage
 from sfmapp.surface import poisson_kernels as kernels
 from sfmapp.surface.bricks import (
     COARSEST_DEPTH,
+    Codes,
     Level,
     Members,
+    Points,
     bricks_around,
+    in_parts,
     make_levels,
     members,
     order_samples,
@@ -84,6 +88,19 @@ class _Samples:
     flux: NDArray[np.float32]
     level_of: NDArray[np.int8]
 
+    @classmethod
+    def of_size(cls, num: int) -> _Samples:
+        """Room for so many."""
+        return cls(
+            np.empty((num, 3), np.float32), np.empty(num, np.int64), np.empty((num, 3), np.float32),
+            np.empty(num, np.int8),
+        )  # fmt: skip
+
+    @property
+    def arrays(self) -> tuple[Points, Codes, Points, NDArray[np.int8]]:
+        """The same, in this order."""
+        return self.points, self.cells, self.flux, self.level_of
+
 
 def depth_for(xyz: NDArray[np.float64], spacing: float) -> int:
     """The depth at which the finest cells, 2^depth a side of the box, measure two spacings or less, 6 to 12.
@@ -100,15 +117,17 @@ def poisson(
     depth: int,
     events: Events | None = None,
     *,
+    threads: int = 1,
     stage: str | None = None,
 ) -> ClosedSurface:
-    """Reconstruct the surface, the same in whichever order the points come.
+    """Reconstruct the surface, the same in whichever order the points come, and with any number of threads.
 
     Args:
         xyz: (N, 3) points, world.
         normal: (N, 3) outward unit normals.
         depth: the finest cells are 2^depth a side of the box.
         events: progress and cancellation.
+        threads: that share the bricks.
         stage: which is told of each level; None: nobody is told.
 
     Raises:
@@ -125,11 +144,12 @@ def poisson(
     if not (np.isfinite(scale) and scale > 0.0):
         raise NoReconstructionError("Poisson reconstruction: expected finite points that are not all the same")
     cell, middle = BOX_SCALE * scale / 2**depth, 2.0 ** (depth - 1)
-    samples = _samples(((xyz - center) / cell + middle).astype(np.float32), normal, depth)
+    samples = _samples(((xyz - center) / cell + middle).astype(np.float32), normal, depth, threads)
     levels = make_levels(samples.points, samples.level_of, samples.cells, depth, REACH, events)
-    values = _solve(samples, levels, events, stage)
+    values = _solve(samples, levels, events, threads, stage)
     del samples
-    vertices, faces = dual_surface(levels, values, events)
+    vertices, faces = dual_surface(levels, values, events, threads)
+    del levels, values
     if len(faces) == 0:
         raise NoReconstructionError("Poisson reconstruction: found no surface", ADVICE)
     vertices, faces = _with_lids(vertices, faces, depth)
@@ -144,7 +164,7 @@ def poisson(
     return ClosedSurface(vertices, faces, usage)
 
 
-def _samples(points: NDArray[np.float32], normal: NDArray[np.float32], depth: int) -> _Samples:
+def _samples(points: NDArray[np.float32], normal: NDArray[np.float32], depth: int, threads: int) -> _Samples:
     """Order points (N, 3), find how dense they are, and so what level and area is that of each."""
     order, cells = order_samples(points, depth)
     points, flux = points[order], normal[order].astype(np.float32)
@@ -157,7 +177,10 @@ def _samples(points: NDArray[np.float32], normal: NDArray[np.float32], depth: in
         counts = np.zeros((len(wide.codes), 64), np.float32)
         kernels.count_samples(points, wide.first, wide.level, counts)
         around = bricks_around(wide.codes)
-        kernels.find_densities(points, is_open, wide.codes, wide.first, wide.level, around, counts, density)
+        find = partial(
+            kernels.find_densities, points, is_open, wide.codes, wide.first, wide.level, around, counts, density
+        )
+        in_parts(find, len(wide.codes), threads)
         found = is_open & ((density >= 4.0 * SAMPLES_PER_CELL) | (level == coarsest))
         level_of[found] = level
         flux[found] *= (4.0 ** (level + 1) / density[found])[:, None]
@@ -169,24 +192,14 @@ def _samples(points: NDArray[np.float32], normal: NDArray[np.float32], depth: in
 
 def _merged(samples: _Samples, level: int) -> _Samples:
     """Samples for a level from the second coarser on: one for those in a sixteenth of a square of its cell's side."""
-    is_fine = samples.level_of <= level
-    codes = samples.cells[is_fine] >> (3 * (level - 2))
-    begins = np.flatnonzero(np.concatenate([[True], codes[1:] != codes[:-1]])) if len(codes) else np.zeros(0, np.int64)
-    counts = np.diff(np.append(begins, len(codes)))
-    points = np.add.reduceat(samples.points[is_fine], begins, dtype=np.float64) / counts[:, None]
-    flux = np.add.reduceat(samples.flux[is_fine], begins, dtype=np.float64)
-    cells = np.concatenate([samples.cells[is_fine][begins], samples.cells[~is_fine]])
-    order = np.argsort(cells, kind="stable")
-    return _Samples(
-        np.concatenate([points.astype(np.float32), samples.points[~is_fine]])[order],
-        cells[order],
-        np.concatenate([flux.astype(np.float32), samples.flux[~is_fine]])[order],
-        np.concatenate([np.full(len(begins), level, np.int8), samples.level_of[~is_fine]])[order],
-    )
+    shift = 3 * (level - 2)
+    found = _Samples.of_size(kernels.merge_samples(*samples.arrays, level, shift, *_Samples.of_size(0).arrays))
+    kernels.merge_samples(*samples.arrays, level, shift, *found.arrays)
+    return found
 
 
 def _solve(
-    samples: _Samples, levels: list[Level], events: Events, stage: str | None
+    samples: _Samples, levels: list[Level], events: Events, threads: int, stage: str | None
 ) -> list[NDArray[np.float32]]:  # fmt: skip
     """Values (B, 64) of the nodes of each level: the indicator, negative within, nought at the surface."""
     coarsest = len(levels) - 1
@@ -196,51 +209,57 @@ def _solve(
         of_level.append(_merged(of_level[-1], len(of_level)))
     for n in range(coarsest, -1, -1):
         samples, level = of_level.pop() if n > 0 else of_level[0], levels[n]
-        here = members(samples.cells, n)
+        here, num = members(samples.cells, n), len(level.codes)
         if stage is not None:
-            events.advanced(stage, 0, f"Poisson, grid {coarsest - n + 1} of {coarsest + 1}: {len(level.codes)} bricks")
+            events.advanced(stage, 0, f"Poisson, grid {coarsest - n + 1} of {coarsest + 1}: {num} bricks")
         at = positions_of(level.codes, here.codes)
-        mine = np.zeros((len(level.codes), 64), np.float32)
+        mine, divergence = np.zeros((num, 64), np.float32), np.zeros((num, 64), np.float32)
         if n < coarsest:
             kernels.prolong(level.codes, level.parent, levels[n + 1].around, values[0], mine)
-        divergence = np.zeros_like(mine)
-        kernels.add_divergence(
-            samples.points, samples.flux, samples.level_of, here.codes, here.first, n, at, level.around, divergence
-        )
+        add = partial(
+            kernels.add_divergence, samples.points, samples.flux, samples.level_of, here.codes, here.first, n, at,
+            level.around, divergence,
+        )  # fmt: skip
+        in_parts(add, num, threads)
         is_whole = np.bool_(n == coarsest)
         sweeps, omega = (COARSEST_SWEEPS, COARSEST_OMEGA) if is_whole else (SWEEPS, OMEGA)
         for sweep in range(2 * sweeps):
             events.raise_if_cancelled()
-            kernels.relax(
-                level.codes, level.is_leaf, is_whole, level.around, level.num, sweep & 1, omega, divergence, mine
-            )
-        del divergence
-        _pass_through_points(samples, here, at, level, mine, is_whole=bool(is_whole))
+            relax = partial(
+                kernels.relax, level.codes, level.is_leaf, is_whole, level.around, level.num, sweep & 1, omega,
+                divergence, mine,
+            )  # fmt: skip
+            in_parts(relax, num, threads)
+        del divergence, add, relax
+        _pass_through_points(samples, here, at, level, mine, threads, is_whole=bool(is_whole))
         values.insert(0, mine)
     return values
 
 
 def _pass_through_points(
-    samples: _Samples, here: Members, at: NDArray[np.int64], level: Level, values: NDArray[np.float32], *,
+    samples: _Samples, here: Members, at: NDArray[np.int64], level: Level, values: NDArray[np.float32], threads: int, *,
     is_whole: bool,
 ) -> None:  # fmt: skip
     """Take from the values of a level what they are at the points."""
     found = np.zeros(len(samples.points), np.float32)
     chosen = samples.level_of <= here.level + 1
-    kernels.evaluate(
-        samples.points, chosen, here.codes, here.first, here.level, at, level.around, values, found
-    )  # fmt: skip
+    told = (chosen, here.codes, here.first, here.level, at, level.around)
+    in_parts(partial(kernels.evaluate, samples.points, *told, values, found), len(here.codes), threads)
     if is_whole:
         # which of the solutions it is that differ by a constant is not told by any normal
         area = np.linalg.norm(samples.flux, axis=1)
         mean = np.float32(np.average(found, weights=area))
         values -= mean
         found -= mean
-    total, count = np.zeros_like(values), np.zeros_like(values)
-    kernels.add_samples(
-        samples.points, found, chosen, here.codes, here.first, here.level, at, level.around, total, count
-    )  # fmt: skip
-    kernels.take_away(level.codes, level.is_leaf, np.bool_(is_whole), level.around, total, count, DOUBT, values)
+
+    def take_away(low: int, high: int) -> None:
+        total, count = np.zeros((high - low, 64), np.float32), np.zeros((high - low, 64), np.float32)
+        kernels.add_samples(samples.points, found, *told, total, count, low, high)
+        kernels.take_away(
+            level.codes, level.is_leaf, np.bool_(is_whole), level.around, total, count, DOUBT, values, low, high
+        )  # fmt: skip
+
+    in_parts(take_away, len(level.codes), threads)
 
 
 def _with_lids(

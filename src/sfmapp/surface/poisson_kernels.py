@@ -2,7 +2,8 @@
 
 Values of nodes are (B, 64) float32, a row for each brick (:mod:`sfmapp.surface.bricks`). Samples (N) come in the order
 of their bricks; ``codes`` (S,) and ``first`` (S + 1,) are their :class:`~sfmapp.surface.bricks.Members`, ``at`` (S,) is
-the number of each of these bricks in the level, -1 where it has none.
+the number of each of these bricks in the level, -1 where it has none. Kernels that take ``low`` and ``high`` work at
+the bricks from one to before the other, so that several threads can share the work: no sum depends on how it is cut.
 """
 
 from __future__ import annotations
@@ -32,12 +33,13 @@ def count_samples(points: Points, first: Codes, level: int, counts: Values) -> N
 
 @numba.njit(cache=True, nogil=True)
 def find_densities(
-    points: Points, asked: Flags, codes: Codes, first: Codes, level: int, around: Ids, counts: Values, density: Values
+    points: Points, asked: Flags, codes: Codes, first: Codes, level: int, around: Ids, counts: Values, density: Values,
+    low: int, high: int,
 ) -> None:  # fmt: skip
     """Write how many samples there are in the square of a cell's side around those that are asked (N,)."""
     scale, weight = 1.0 / (1 << level), np.empty((3, 3))
     window, place, cell = np.empty((6, 6, 6)), np.empty(3, np.int64), np.empty(3, np.int64)
-    for b in range(codes.shape[0]):
+    for b in range(low, high):
         is_loaded = False
         for i in range(first[b], first[b + 1]):
             if not asked[i]:
@@ -57,6 +59,42 @@ def find_densities(
                         share = weight[0, x] * weight[1, y] * weight[2, z]
                         total += share * window[cell[2] + z, cell[1] + y, cell[0] + x]
             density[i] = total / _PLANE
+
+
+@numba.njit(cache=True, nogil=True)
+def merge_samples(
+    points: Points, cells: Codes, flux: Points, level_of: NDArray[np.int8], level: int, shift: int, out_points: Points,
+    out_cells: Codes, out_flux: Points, out_level_of: NDArray[np.int8],
+) -> int:  # fmt: skip
+    """Write samples of which one, amid the others and of as much area, stands for all up to a level whose cells' codes
+    have all but the last ``shift`` bits in common, or count them if there is no room for any."""
+    count, begin, sums, total = 0, 0, np.empty(3), np.empty(3)
+    while begin < points.shape[0]:
+        end, num, at = begin, 0, -1
+        sums[:] = 0.0
+        total[:] = 0.0
+        while end < points.shape[0] and cells[end] >> shift == cells[begin] >> shift:
+            is_fine = level_of[end] <= level
+            if is_fine:
+                num += 1
+                for axis in range(3):
+                    sums[axis] += points[end, axis]
+                    total[axis] += flux[end, axis]
+            if not is_fine or at < 0:
+                if is_fine:
+                    at = count
+                if out_cells.shape[0]:
+                    out_points[count], out_cells[count] = points[end], cells[end]
+                    out_flux[count], out_level_of[count] = flux[end], level_of[end]
+                count += 1
+            end += 1
+        if at >= 0 and out_cells.shape[0]:
+            out_level_of[at] = level
+            for axis in range(3):
+                out_points[at, axis] = np.float32(sums[axis] / num)
+                out_flux[at, axis] = np.float32(total[axis])
+        begin = end
+    return count
 
 
 @numba.njit(cache=True, nogil=True)
@@ -84,22 +122,32 @@ def _b3(t: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_window(window: Array, low: int, around: Ids, b: int, values: Values) -> None:
-    """Add a window (K, K, K) of nodes, its first at ``low`` in all three directions, to a brick and those around it."""
+def _is_near(around: Ids, b: int, low: int, high: int) -> bool:
+    """Whether a brick or one of those around it is among some."""
+    is_near = False
+    for k in range(27):
+        is_near |= low <= around[b, k] < high
+    return is_near
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_window(window: Array, start: int, around: Ids, b: int, values: Values, low: int, high: int) -> None:
+    """Add a window (K, K, K) of nodes, its first at ``start`` in all three directions, to those values (high - low, 64)
+    of a brick and of those around it that are among some."""
     for z in range(window.shape[0]):
         for y in range(window.shape[1]):
             for x in range(window.shape[2]):
                 if window[z, y, x] != 0.0:
-                    u, v, w = x + low + 4, y + low + 4, z + low + 4
+                    u, v, w = x + start + 4, y + start + 4, z + start + 4
                     other = around[b, (u >> 2) + 3 * (v >> 2) + 9 * (w >> 2)]
-                    if other >= 0:
-                        values[other, (u & 3) + 4 * (v & 3) + 16 * (w & 3)] += np.float32(window[z, y, x])
+                    if low <= other < high:
+                        values[other - low, (u & 3) + 4 * (v & 3) + 16 * (w & 3)] += np.float32(window[z, y, x])
 
 
 @numba.njit(cache=True, nogil=True)
 def add_divergence(
     points: Points, flux: Points, level_of: NDArray[np.int8], codes: Codes, first: Codes, level: int, at: Codes,
-    around: Ids, divergence: Values,
+    around: Ids, divergence: Values, low: int, high: int,
 ) -> None:  # fmt: skip
     """Add the divergence, summed over a cell, of the samples' areas times normals, ``flux`` (N, 3), in finest cells.
 
@@ -110,8 +158,9 @@ def add_divergence(
     """
     scale, window, place = 1.0 / (1 << level), np.empty((12, 12, 12)), np.empty(3, np.int64)
     weight, step, begin, vector = np.empty((3, 8)), np.empty((3, 8)), np.empty(3, np.int64), np.empty(3)
+    mine = divergence[low:high]
     for b in range(codes.shape[0]):
-        if at[b] < 0:
+        if at[b] < 0 or not _is_near(around, at[b], low, high):
             continue
         place_of(codes[b], place)
         is_used = False
@@ -143,7 +192,7 @@ def add_divergence(
                     for x in range(min(num, 12 - begin[0])):
                         window[begin[2] + z, begin[1] + y, begin[0] + x] += along * step[0, x] + across * weight[0, x]
         if is_used:
-            _add_window(window, -4, around, at[b], divergence)
+            _add_window(window, -4, around, at[b], mine, low, high)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -187,7 +236,7 @@ def _free_corners(b: int, is_leaf: Flags, around: Ids, place: Codes) -> int:
 @numba.njit(cache=True, nogil=True)
 def relax(
     codes: Codes, is_leaf: Flags, is_whole: np.bool_, around: Ids, num: int, colour: int, omega: float,
-    divergence: Values, values: Values,
+    divergence: Values, values: Values, low: int, high: int,
 ) -> None:  # fmt: skip
     """Half a sweep of successive over-relaxation, over the nodes of one colour of a chessboard.
 
@@ -195,7 +244,7 @@ def relax(
     the whole box nothing flows through the sides.
     """
     window, place = np.empty((6, 6, 6)), np.empty(3, np.int64)
-    for b in range(codes.shape[0]):
+    for b in range(low, high):
         place_of(codes[b], place)
         is_last = 4 * place[0] >= num or 4 * place[1] >= num or 4 * place[2] >= num
         # the last bricks have nothing but nodes on the sides of the box
@@ -238,12 +287,12 @@ def _cubic(t: float, weight: Array) -> None:
 @numba.njit(cache=True, nogil=True)
 def evaluate(
     points: Points, chosen: Flags, codes: Codes, first: Codes, level: int, at: Codes, around: Ids, values: Values,
-    found: Values,
+    found: Values, low: int, high: int,
 ) -> None:  # fmt: skip
     """Write (N,) the values at samples that are chosen, by cubics along each axis."""
     scale, window, place = 1.0 / (1 << level), np.empty((7, 7, 7)), np.empty(3, np.int64)
     weight, cell = np.empty((3, 4)), np.empty(3, np.int64)
-    for b in range(codes.shape[0]):
+    for b in range(low, high):
         if at[b] < 0:
             continue
         place_of(codes[b], place)
@@ -271,14 +320,16 @@ def evaluate(
 @numba.njit(cache=True, nogil=True)
 def add_samples(
     points: Points, told: Values, chosen: Flags, codes: Codes, first: Codes, level: int, at: Codes, around: Ids,
-    total: Values, count: Values,
+    total: Values, count: Values, low: int, high: int,
 ) -> None:  # fmt: skip
-    """Add what samples tell (N,) to the nodes around those that are chosen, by quadratic B-splines, and how many tell
-    it."""
+    """Add what samples tell (N,) to the nodes (high - low, 64) around those that are chosen, by quadratic B-splines.
+
+    And how many tell it.
+    """
     scale, sums, counts = 1.0 / (1 << level), np.empty((7, 7, 7)), np.empty((7, 7, 7))
     place, node, weight = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3))
     for b in range(codes.shape[0]):
-        if at[b] < 0:
+        if at[b] < 0 or not _is_near(around, at[b], low, high):
             continue
         place_of(codes[b], place)
         is_used = False
@@ -300,26 +351,26 @@ def add_samples(
                         counts[node[2] + z, node[1] + y, node[0] + x] += share
                         sums[node[2] + z, node[1] + y, node[0] + x] += share * told[i]
         if is_used:
-            _add_window(sums, -1, around, at[b], total)
-            _add_window(counts, -1, around, at[b], count)
+            _add_window(sums, -1, around, at[b], total, low, high)
+            _add_window(counts, -1, around, at[b], count, low, high)
 
 
 @numba.njit(cache=True, nogil=True)
 def take_away(
     codes: Codes, is_leaf: Flags, is_whole: np.bool_, around: Ids, total: Values, count: Values, doubt: float,
-    values: Values,
+    values: Values, low: int, high: int,
 ) -> None:  # fmt: skip
     """Take from values what samples tell on average, as if ``doubt`` more had told that nothing is to be taken.
 
     The coarser level has the say at the border of what the level answers for: what is on its other side is not ours.
     """
     place = np.empty(3, np.int64)
-    for b in range(values.shape[0]):
+    for b in range(low, high):
         if not (is_leaf[b] or is_whole):
             continue
         place_of(codes[b], place)
         free = 255 if is_whole else _free_corners(b, is_leaf, around, place)
         for n in range(64):
             at_sides = np.int64(n & 3 == 0) | np.int64(n >> 2 & 3 == 0) << 1 | np.int64(n >> 4 == 0) << 2
-            if count[b, n] > 0.0 and free >> at_sides & 1:
-                values[b, n] -= np.float32(total[b, n] / (count[b, n] + doubt))
+            if count[b - low, n] > 0.0 and free >> at_sides & 1:
+                values[b, n] -= np.float32(total[b - low, n] / (count[b - low, n] + doubt))

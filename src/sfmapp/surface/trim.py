@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,13 +73,34 @@ def in_view(xyz: NDArray[np.float64], faces: NDArray[np.int32], scene: DenseScen
 def pieces(faces: NDArray[np.int32], num_vertices: int) -> NDArray[np.int32]:
     """(F,) number of the piece that each face (F, 3), or edge (F, 2), belongs to: those hang together that share a
     vertex."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    root = np.arange(num_vertices, dtype=np.int32)
+    _join_vertices(np.ascontiguousarray(faces), root)
+    mine = root[faces[:, 0]]
+    is_root = np.zeros(num_vertices, np.bool_)
+    is_root[mine] = True
+    return (np.cumsum(is_root, dtype=np.int32) - np.int32(1))[mine]
 
-    start, end = faces[:, :-1].ravel(), faces[:, 1:].ravel()
-    graph = coo_array((np.ones(len(start), np.bool_), (start, end)), (num_vertices, num_vertices))
-    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.unique(labels, return_inverse=True)[1].astype(np.int32)
+
+@numba.njit(cache=True, nogil=True)
+def _join_vertices(faces: NDArray[np.int32], root: NDArray[np.int32]) -> None:
+    """Join the vertices (N) of each face (F, K); ``root``, at first each its own, becomes the lowest that hangs
+    together with each."""
+    for f in range(faces.shape[0]):
+        for k in range(1, faces.shape[1]):
+            a, b = faces[f, 0], faces[f, k]
+            # halve the way to the root on the way there (Tarjan and van Leeuwen, 1984)
+            while root[a] != a:
+                root[a] = root[root[a]]
+                a = root[a]
+            while root[b] != b:
+                root[b] = root[root[b]]
+                b = root[b]
+            if a < b:
+                root[b] = a
+            else:
+                root[a] = b
+    for v in range(root.shape[0]):
+        root[v] = root[root[v]]  # none lies above its root, so that is known to be one
 
 
 def without_islands(
