@@ -14,6 +14,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -85,6 +86,7 @@ def rows_of(folder: Path) -> list[Row]:
     """All rows, benchmark by benchmark, of those whose results are there."""
     makers = {
         "sparse": sparse_rows,
+        "sparse_peers": sparse_peer_rows,
         "bundle_adjustment": adjustment_rows,
         "large_adjustment": large_adjustment_rows,
         "town": town_rows,
@@ -551,15 +553,27 @@ def pair_rows(folder: Path) -> Iterator[Row]:
 
 def sparse_rows(folder: Path) -> Iterator[Row]:
     """``sfmapp reconstruct`` against pycolmap."""
-    report = read(folder, "sparse")
-    for case, programs in report["medians"].items():
-        for path, quantity, unit, better in SPARSE:
-            ours, theirs = (programs[program].get(path) for program in ("sfmapp", "pycolmap"))
+    yield from _rows_against(read(folder, "sparse"), "sparse", ("pycolmap",), SPARSE)
+
+
+def sparse_peer_rows(folder: Path) -> Iterator[Row]:
+    """The same against pycolmap's global mapper and openmvg-rs, without wall times: the machine had other work."""
+    quantities = tuple(row for row in SPARSE if row[0] != "wall_s")
+    report = read(folder, "sparse_peers")
+    yield from _rows_against(report, "sparse_peers", ("pycolmap global", "openmvg-rs"), quantities)
+
+
+def _rows_against(
+    report: dict[str, Any], benchmark: str, peers: tuple[str, ...], quantities: tuple[tuple[str, ...], ...]
+) -> Iterator[Row]:
+    for (case, programs), peer in product(report["medians"].items(), peers):
+        for path, quantity, unit, better in quantities:
+            ours, theirs = (programs.get(program, {}).get(path) for program in ("sfmapp", peer))
             if unit == "%":
                 ours, theirs = (None if value is None else 100 * value for value in (ours, theirs))
             if ours is not None:
                 yield Row(
-                    "sparse", case, quantity, unit, better, ours, "pycolmap", theirs, False, report["date"][:10],
+                    benchmark, case, quantity, unit, better, ours, peer, theirs, False, report["date"][:10],
                     report["commit"],
                 )  # type: ignore[arg-type]  # fmt: skip
 
