@@ -32,8 +32,8 @@ from sfmapp.scene.reconstruction import Reconstruction
 _STEP = "mapping parts"
 
 
-# Fewer images take less time as a whole: 300 views of a rendered town two thirds of it, 1,000 four fifths, and of 3,000
-# the parts alone took nearly what the whole does. Where the two meet has not been measured: it lies beyond.
+# Fewer images take less time as a whole: 300 views of a rendered town three quarters of it and 1,000 four fifths. Where
+# the two meet has not been measured: of 3,000 neither has been run to its end on the same code.
 FEWEST = 5000
 # So large a share of the verified matches may agree with submaps and not with the model of all: of a rendered town it
 # is 0.00002, and two maps are taken for the same up to this difference where starts are compared too.

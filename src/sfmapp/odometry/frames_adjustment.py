@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 # Frames and keyframes that are adjusted together at most; of more frames every so many takes part.
 _MOST_IMAGES = 2000
 # Rounds, each of which decides afresh which observations agree, and the most steps of each: later ones let go of single
-# observations. Of 8 steps instead of 4 errors are 1.95, 2.77 and 3.18 for 2.02, 2.47 and 3.22 mm (rendered hand-held
-# rooms 1, 2 and 4, of which 4 chose nothing), for 1.6 times the time. Every other frame alone was 2.00, 2.66 and 3.67.
+# observations. Of 8 steps instead of 4 errors are 1.95, 2.77 and 3.00 for 2.02, 2.47 and 3.08 mm (rendered hand-held
+# rooms 1, 2 and 4, of which 4 chose nothing), for 1.6 times the time. With every other frame alone 4 had 3.51.
 _ROUNDS, _STEPS, _TOLERANCE = 2, 4, 1e-5
 
 
