@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.adjust.envelope import NO_PIVOT, EnvelopeOrder, EnvelopeSystem, gather_panel
-from sfmapp.adjust.fronts import FrontOrder
+from sfmapp.adjust.fronts import FrontOrder, substitute
 from sfmapp.adjust.linear import may_suit_fronts, prefers_fronts
 
 Array = NDArray[np.float64]
@@ -37,10 +37,7 @@ class FrontSystem:
         self._dim, self._order = block_dim, order
         dims = block_dim[np.argsort(order.position)]
         self._at = (np.cumsum(dims) - dims)[order.position]  # first unknown of each block, as they are eliminated
-        self._unknowns = [_spread(self._at[blocks], block_dim[blocks]) for blocks in order.blocks]
-        self._num_own = [
-            int(block_dim[blocks[:own]].sum()) for blocks, own in zip(order.blocks, order.num_own, strict=True)
-        ]
+        self._unknowns, self._num_own = order.unknowns(self._at, block_dim)
         self._places = self._places_of_tiles(*np.divmod(keys, len(block_dim)), numbers)
         self._children: list[list[int]] = [[] for _ in order.blocks]
         self._at_parent: list[Ints] = []
@@ -125,17 +122,7 @@ class FrontSystem:
         at = (self._at[:, None] + np.arange(8))[used]
         x = np.empty(len(at))
         x[at] = rhs.reshape(-1, 8)[used]
-        fronts = [
-            (slice(unknowns[0], unknowns[0] + k), unknowns[k:], inverse, below)
-            for unknowns, k, inverse, below in zip(
-                self._unknowns, self._num_own, self._inverse, self._below, strict=True
-            )
-        ]
-        for own, behind, inverse, below in fronts:
-            x[own] = inverse @ x[own]
-            x[behind] -= below @ x[own]
-        for own, behind, inverse, below in reversed(fronts):
-            x[own] = inverse.T @ (x[own] - below.T @ x[behind])
+        substitute(self._unknowns, self._num_own, self._inverse, self._below, x)
         step = np.zeros((len(self._dim), 8))
         step[used] = x[at]
         return step.ravel()
@@ -172,12 +159,6 @@ def flops_of_fronts(order: FrontOrder, block_dim: Ints) -> Array:
     rest = size - own
     flops: Array = own * (4.0 / 3.0 * own**2 + 2.0 * own * rest + rest**2)
     return flops
-
-
-def _spread(start: Ints, length: Ints) -> Ints:
-    """Numbers from each start on, so many of each."""
-    first = np.cumsum(length) - length
-    return (np.repeat(start - first, length) + np.arange(int(length.sum()))).astype(np.int64)
 
 
 def _parted(parent: Ints, flops: Array) -> tuple[list[range], list[int]]:

@@ -11,7 +11,6 @@ adjustment", 1980).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -50,6 +49,17 @@ class FrontOrder:
             for i, e in zip(first, end, strict=True)
         ]
         self.num_entries = int(sizes.sum()) + num_blocks
+
+    def unknowns(self, first: Ints, num: Ints) -> tuple[list[Ints], list[int]]:
+        """Of each front, its unknowns and how many it eliminates; those of each block (B,) are so many from the first
+        on."""
+        found = []
+        for blocks in self.blocks:
+            count = num[blocks]
+            begin = np.cumsum(count) - count
+            found.append((np.repeat(first[blocks] - begin, count) + np.arange(int(count.sum()))).astype(np.int64))
+        num_own = [int(num[blocks[:own]].sum()) for blocks, own in zip(self.blocks, self.num_own, strict=True)]
+        return found, num_own
 
 
 def _least_degree(num_blocks: int, a: Ints, b: Ints) -> Ints:
@@ -107,6 +117,18 @@ def order_of(matrix: Any, block_of: Ints) -> FrontOrder:
     return FrontOrder(num_blocks, *np.divmod(pairs, num_blocks))
 
 
+def substitute(unknowns: list[Ints], num_own: list[int], inverse: list[Array], below: list[Array], x: Array) -> None:
+    """Solve in place for right-hand sides x (N, ...) by a factor: of each front its unknowns and how many of them, the
+    first, it eliminates, the inverse of the factor over these, and what is below it."""
+    fronts = list(zip(unknowns, num_own, inverse, below, strict=True))
+    for places, k, upper, rest in fronts:
+        own = upper @ x[places[:k]]
+        x[places[:k]] = own
+        x[places[k:]] -= rest @ own
+    for places, k, upper, rest in reversed(fronts):
+        x[places[:k]] = upper.T @ (x[places[:k]] - rest.T @ x[places[k:]])
+
+
 class FrontFactor:
     """The factor of a symmetric sparse matrix, by fronts."""
 
@@ -118,11 +140,7 @@ class FrontFactor:
         """
         self.order = order
         first = np.searchsorted(block_of, np.arange(len(order.position) + 1))
-        unknowns = [np.arange(i, j) for i, j in pairwise(first)]
-        self.unknowns = [np.concatenate([unknowns[b] for b in blocks]) for blocks in order.blocks]
-        self.num_own = [
-            sum(len(unknowns[b]) for b in blocks[:own]) for blocks, own in zip(order.blocks, order.num_own, strict=True)
-        ]
+        self.unknowns, self.num_own = order.unknowns(first[:-1], np.diff(first))
         self._rank = np.empty(len(block_of), np.int64)  # of each unknown in the order of elimination
         self._rank[np.concatenate([u[:k] for u, k in zip(self.unknowns, self.num_own, strict=True)])] = np.arange(
             len(block_of)
@@ -159,13 +177,7 @@ class FrontFactor:
     def solve(self, right: Array) -> Array:
         """(N, ...) of a right-hand side (N, ...)."""
         x = np.array(right, np.float64)
-        fronts = list(zip(self.unknowns, self.num_own, self._inverse, self._below, strict=True))
-        for unknowns, k, inverse, below in fronts:
-            own = inverse @ x[unknowns[:k]]
-            x[unknowns[:k]] = own
-            x[unknowns[k:]] -= below @ own
-        for unknowns, k, inverse, below in reversed(fronts):
-            x[unknowns[:k]] = inverse.T @ (x[unknowns[:k]] - below.T @ x[unknowns[k:]])
+        substitute(self.unknowns, self.num_own, self._inverse, self._below, x)
         return x
 
     def inverse(self) -> Iterator[tuple[Ints, int, Array]]:

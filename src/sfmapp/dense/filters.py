@@ -24,6 +24,7 @@ from sfmapp.dense.arrays import (
 )
 from sfmapp.dense.expand import place
 from sfmapp.dense.patch_kernels import NEAR, cell_of, cell_size, off_planes, project
+from sfmapp.geometry.components import find_root
 from sfmapp.simd.pointers import Index, offset
 
 # cells to each side that are asked for patches of the same surface, and how many of them have to have one
@@ -179,9 +180,9 @@ def group_sizes(
     sizes = np.zeros(count, np.int32)
     for p in range(count):
         if store.num_views[p] >= min_views:
-            sizes[_root(parent, p)] += 1
+            sizes[find_root(parent, p)] += 1
     for p in range(count):
-        sizes[p] = sizes[_root(parent, p)]
+        sizes[p] = sizes[find_root(parent, p)]
     return sizes
 
 
@@ -195,14 +196,6 @@ def _join(
             return
         size = max(cell_size(images, store, p), cell_size(images, store, q))
         if q != p and off_planes(store, p, store, q) < f32(2.0 * NEAR) * size:
-            a, b = _root(parent, p), _root(parent, q)
+            a, b = find_root(parent, p), find_root(parent, q)
             if a != b:
                 parent[max(a, b)] = min(a, b)
-
-
-@numba.njit(cache=True, nogil=True)
-def _root(parent: NDArray[np.int32], p: int) -> int:
-    while parent[p] != p:
-        parent[p] = parent[parent[p]]
-        p = parent[p]
-    return p

@@ -19,10 +19,9 @@ from sfmapp.events import Events
 from sfmapp.geometry import rigid3
 from sfmapp.mapping.focal_priors import Mapped
 from sfmapp.mapping.mapper import STAGE
-from sfmapp.mapping.report import LookAlikesReport, NamedPair
+from sfmapp.mapping.report import LookAlikesReport, named_pairs
 from sfmapp.mapping.verified_pairs import (
     CLEARLY,
-    NUM_NAMED,
     Chains,
     Standing,
     pair_strengths,
@@ -172,18 +171,10 @@ def _size(mapped: Mapped) -> int:
 
 def _report(correspondences: Correspondences, best: _Attempt, before: _Attempt) -> LookAlikesReport:
     matches = correspondences.num_inliers[best.dropped]
-    names = best.mapped.models[0].image_names
-    strongest = best.dropped[np.argsort(-matches, kind="stable")[:NUM_NAMED]]
     return LookAlikesReport(
         num_pairs_dropped=len(best.dropped),
         num_matches_dropped=int(matches.sum()),
         num_matches_against_before=before.against,
         num_matches_against=best.against,
-        pairs=[
-            NamedPair(
-                images=[names[i] for i in correspondences.pair_image_idx[p]],
-                num_matches=int(correspondences.num_inliers[p]),
-            )
-            for p in strongest
-        ],
+        pairs=named_pairs(best.mapped.models[0].image_names, correspondences.pair_image_idx[best.dropped], matches),
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sfmapp.camera.lens import project
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry.triangulation import Views
-from sfmapp.mapping.report import NearPair
+from sfmapp.mapping.report import NUM_NAMED, NearPair
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
 
@@ -38,7 +38,6 @@ MIN_VISIBLE = 50
 MAX_MISSING_SHARE = 0.2
 # Pairs that it takes to call a model wrong: one may have been lost to blur or to something that came before the camera.
 MIN_PAIRS = 2
-_NUM_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
     missing = np.flatnonzero(found.is_missing)
     if len(missing) < MIN_PAIRS:
         return []
-    order = missing[np.argsort(-found.num_visible[missing], kind="stable")][:_NUM_NAMED]
+    order = missing[np.argsort(-found.num_visible[missing], kind="stable")][:NUM_NAMED]
     named = [
         NearPair(
             images=[model.image_names[i] for i in found.image_idx[k]], num_visible=int(found.num_visible[k]),

@@ -18,7 +18,7 @@ from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import epipolar, rigid3
 from sfmapp.geometry.fit import robust_sigma
 from sfmapp.mapping.focal import matched_pixels
-from sfmapp.mapping.report import NamedPair
+from sfmapp.mapping.report import NUM_NAMED, NamedPair
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.matching.options import MatchingOptions
 from sfmapp.matching.search import Ransac, essentials_of_samples, relative_pose_at_noise
@@ -43,7 +43,6 @@ _MOST_SQUARED = 9.0
 _BENT = 0.04
 # A pair speaks against it from here on: of right models no pair of 45 matches gained more than 0.35, and few 0.2.
 _AGAINST = 0.2
-_NUM_NAMED = 5
 
 
 class _Motion(NamedTuple):
@@ -74,7 +73,7 @@ def contradiction_of(model: Reconstruction, correspondences: Correspondences) ->
             images=[model.image_names[i] for i in correspondences.pair_image_idx[motion.pair_idx]],
             num_matches=motion.num_matches,
         )
-        for motion in against[:_NUM_NAMED]
+        for motion in against[:NUM_NAMED]
     ]
     turn, shift = (float(np.median([motion[k] for motion in against])) for k in (3, 4))
     centers = model.centers[model.is_registered]

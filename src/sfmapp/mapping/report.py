@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfmapp.adjust.options import AdjustReport
 from sfmapp.contradictions import Contradiction
 from sfmapp.reporting import Report
@@ -49,6 +52,12 @@ class FocalReport(Report):
     kept: Literal["as_given", "as_unknown"] | None = None
 
 
+# Pairs that are named; the numbers count all.
+NUM_NAMED = 5
+# Two shared images hold the similarity of two submaps, the third one tells whether it is right.
+MIN_SHARED = 3
+
+
 class NamedPair(Report):
     """A verified pair of images; ``num_agreeing``: matches that agree with the model, ``num_shared_points``: those that
     are points of it."""
@@ -57,6 +66,14 @@ class NamedPair(Report):
     num_matches: int
     num_agreeing: int | None = None
     num_shared_points: int | None = None
+
+
+def named_pairs(
+    image_names: Sequence[str], image_idx: NDArray[np.integer], num_matches: NDArray[np.integer]
+) -> list[NamedPair]:
+    """Those of pairs (P, 2) that have most verified matches (P,), and of as many those that come first."""
+    order = np.argsort(-num_matches, kind="stable")[:NUM_NAMED]
+    return [NamedPair(images=[image_names[i] for i in image_idx[k]], num_matches=int(num_matches[k])) for k in order]
 
 
 class NearPair(Report):

@@ -20,6 +20,7 @@ from sfmapp.geometry import rigid3, similarity
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.merge import find_merge
 from sfmapp.mapping.options import MappingOptions
+from sfmapp.mapping.report import MIN_SHARED
 from sfmapp.mapping.submaps import Submap
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.tracks import Tracks, make_tracks
@@ -28,8 +29,6 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Two shared images hold a similarity, the third one tells whether it is right.
-MIN_SHARED = 3
 # A shared image is elsewhere by so many standard deviations of both, which are those of noise alone, and by so many
 # degrees or this share of the distance of what it sees: as much as two models of one place do not differ by. A third of
 # them may be, as images that either submap holds by little.

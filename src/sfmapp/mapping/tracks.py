@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.geometry.components import find_root
 from sfmapp.mapping.report import TracksReport
 from sfmapp.scene.correspondences import Correspondences, TwoViewConfig
 from sfmapp.scene.features import Features
@@ -36,13 +37,7 @@ def _join(
         size[i] = 1
     refused = 0
     for m in range(first.shape[0]):
-        a, b = first[m], second[m]
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
+        a, b = find_root(parent, first[m]), find_root(parent, second[m])
         if a == b:
             continue
         if size[a] < size[b]:

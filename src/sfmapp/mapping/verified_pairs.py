@@ -22,7 +22,7 @@ from sfmapp.camera.lens import undistort, unproject
 from sfmapp.contradictions import Contradiction
 from sfmapp.geometry import rigid3
 from sfmapp.mapping import near_views, pair_motions
-from sfmapp.mapping.report import NamedPair
+from sfmapp.mapping.report import NUM_NAMED, NamedPair, named_pairs
 from sfmapp.mapping.tracks import USELESS_CONFIGS
 from sfmapp.scene.correspondences import Correspondences
 from sfmapp.scene.reconstruction import Reconstruction
@@ -57,8 +57,6 @@ CLEARLY = 4 / 3
 MIN_MATCHES_BETWEEN = 100
 # Strength from which on a pair matches in most of the picture.
 MOST = 0.5
-# Pairs that are named; the numbers count all.
-NUM_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -309,10 +307,7 @@ def _between(
     if len(pairs) == 0:
         return []
     matches = correspondences.num_inliers[pairs]
-    order = np.argsort(-matches, kind="stable")[:NUM_NAMED]
-    named = [
-        NamedPair(images=[model.image_names[i] for i in images[pairs[k]]], num_matches=int(matches[k])) for k in order
-    ]
+    named = named_pairs(model.image_names, images[pairs], matches)
     strongest = named[0]
     message = (
         f"{_count(len(pairs), 'pair')} with {matches.sum()} verified matches link it to model {other_idx}, but the two "
@@ -346,10 +341,7 @@ def _left_out(
         return []
     matches = correspondences.num_inliers[pairs]
     left_out = np.unique(images[pairs][nowhere[images[pairs]]])
-    named = [
-        NamedPair(images=[model.image_names[i] for i in images[pairs[k]]], num_matches=int(matches[k]))
-        for k in np.argsort(-matches, kind="stable")[:NUM_NAMED]
-    ]
+    named = named_pairs(model.image_names, images[pairs], matches)
     message = (
         f"{_count(len(left_out), 'photograph')} that no model holds match photographs of the model in most of the "
         f"picture: {named[0].images[0]} and {named[0].images[1]} have {named[0].num_matches} verified matches"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from sfmapp.mapping.report import FailedPartReport, PartsReport, SeamReport, SubmapReport
+from sfmapp.mapping.report import MIN_SHARED, FailedPartReport, PartsReport, SeamReport, SubmapReport
 from sfmapp.report.page import table
 
 _ABOUT = (
@@ -13,8 +13,6 @@ _ABOUT = (
     "are held against each other in these, and what agrees is adjusted as one model. Images of a part that is left out "
     "are registered one by one from where their neighbours are."
 )
-# Two images hold a similarity, and only more could tell that it is wrong.
-_ENOUGH_TO_DISAGREE = 3
 
 
 def parts_section(report: PartsReport) -> str:
@@ -52,7 +50,7 @@ def _seams(seams: Sequence[SeamReport], submaps: Sequence[SubmapReport]) -> str:
     for seam in seams:
         names = " and ".join(f"{n}: {submaps[n].first_image} ..." for n in seam.submaps)
         light = "red" if seam.reason else "green"
-        if seam.reason and seam.num_images < _ENOUGH_TO_DISAGREE:
+        if seam.reason and seam.num_images < MIN_SHARED:
             light = "grey"
         rows.append([
             (f"t {light}", names), ("", seam.num_images), ("", seam.num_elsewhere or None),

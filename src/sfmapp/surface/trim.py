@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene
+from sfmapp.geometry.components import find_root
 from sfmapp.scene.mesh import face_areas, face_vectors
 from sfmapp.surface.patch_cloud import CHUNK, PatchCloud
 
@@ -87,14 +88,7 @@ def _join_vertices(faces: NDArray[np.int32], root: NDArray[np.int32]) -> None:
     together with each."""
     for f in range(faces.shape[0]):
         for k in range(1, faces.shape[1]):
-            a, b = faces[f, 0], faces[f, k]
-            # halve the way to the root on the way there (Tarjan and van Leeuwen, 1984)
-            while root[a] != a:
-                root[a] = root[root[a]]
-                a = root[a]
-            while root[b] != b:
-                root[b] = root[root[b]]
-                b = root[b]
+            a, b = find_root(root, faces[f, 0]), find_root(root, faces[f, k])
             if a < b:
                 root[b] = a
             else:
