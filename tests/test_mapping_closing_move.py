@@ -14,6 +14,7 @@ from sfmapp.adjust.covariance import pose_errors_in_gauge
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.events import Events
 from sfmapp.mapping.closing_move import COVERED_SIGMAS, ClosingMove, closing_move, widened_by_move
+from sfmapp.mapping.intrinsics_check import widened_uncertainty
 from sfmapp.mapping.mapper import Mapper
 from sfmapp.mapping.options import MappingOptions
 from sfmapp.mapping.report import CameraSigmas, ImageSigmas, Uncertainty
@@ -128,3 +129,12 @@ def test_a_far_move_widens_all_sigmas_and_is_said(sigmas: float) -> None:
     assert grown.cameras[0].sigma["f"] == pytest.approx(2.0 * factor)
     assert len(said) == (sigmas > 5.0)
     assert widened_by_move(Uncertainty(), move, Events()) == Uncertainty()
+
+
+def test_what_moves_nothing_makes_no_sigma_of_zero_where_none_is_known() -> None:
+    model = make_scene(0, 4, 50, sigma_px=0.3).observed
+    assert widened_uncertainty(Uncertainty(), model, 0.0, 0.0) == Uncertainty()
+    at_least = widened_uncertainty(Uncertainty(), model, 0.04, 1.5)
+    assert (at_least.median_center_sigma_share, at_least.worst_center_sigma_share) == (0.04, 0.04)
+    assert at_least.median_rotation_sigma_deg == 1.5
+    assert widened_uncertainty(at_least, model, 0.0, 0.0) == at_least

@@ -319,9 +319,15 @@ def _values(camera: Camera) -> str:
 
 
 def widened_uncertainty(uncertainty: Uncertainty, model: Reconstruction, spread: float, turn: float) -> Uncertainty:
-    """The uncertainty with an independent error of all poses: a share of the rms spread of the centres, and degrees."""
+    """The uncertainty with an independent error of all poses: a share of the rms spread of the centres, and degrees.
+
+    Where nothing else is known of the poses these alone are told; an error of zero tells nothing.
+    """
     if uncertainty.median_center_sigma_share is None or uncertainty.worst_center_sigma_share is None:
-        return Uncertainty(median_center_sigma_share=spread, worst_center_sigma_share=spread)
+        return replace(
+            uncertainty, median_center_sigma_share=spread or None, worst_center_sigma_share=spread or None,
+            median_rotation_sigma_deg=turn or None,
+        )  # fmt: skip
     centers = model.centers[model.is_registered]
     distances = np.linalg.norm(centers - centers.mean(0), axis=1)
     share = spread * float(np.sqrt((distances**2).mean()) / distances.max())  # of the uncertainty's size
