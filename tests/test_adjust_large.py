@@ -134,6 +134,10 @@ def test_factors_of_large_systems_solve_those_of_any_pattern(monkeypatch, kind, 
     assert not found[~used].any()
     with ThreadPoolExecutor(3) as pool:
         assert (system.solve(tiles, right.ravel(), pool.map).reshape(-1, 8) == found).all()
+    if system_of is front_system:
+        both = system.substitute(np.stack([right.ravel(), -2.0 * right.ravel()], 1))
+        np.testing.assert_allclose(both.T, np.outer([1.0, -2.0], found), rtol=1e-9, atol=1e-12)
+        assert_tiles_of_the_inverse(system, dims, keys, np.linalg.inv(matrix))
     if kind == "loop" and system_of is envelope_system:  # both ways round at once, beside the last rows
         full = EnvelopeSystem(dims, np.flatnonzero(np.triu(np.ones((num, num)))), np.arange(num * (num + 1) // 2))
         assert system.order.flops < 0.6 * full.order.flops
@@ -141,6 +145,18 @@ def test_factors_of_large_systems_solve_those_of_any_pattern(monkeypatch, kind, 
     place = int(np.flatnonzero(keys == (num - 1) * (num + 1))[0]) * 64
     tiles[place] = -1.0
     assert system.solve(tiles, right.ravel()) is None
+
+
+def assert_tiles_of_the_inverse(system, dims, keys, inverse):
+    """Those of all pairs that meet, either way round."""
+    first, used = np.cumsum(dims) - dims, np.arange(8) < dims[:, None]
+    a, b = np.divmod(keys, len(dims))
+    a, b = np.concatenate([a, b]), np.concatenate([b, a])
+    found = system.inverse_tiles(a, b)
+    for n in range(len(a)):
+        rows, columns = (slice(first[k], first[k] + dims[k]) for k in (a[n], b[n]))
+        np.testing.assert_allclose(found[n, : dims[a[n]], : dims[b[n]]], inverse[rows, columns], rtol=1e-8, atol=1e-12)
+    assert not found[~(used[a][:, :, None] & used[b][:, None])].any()
 
 
 def test_fronts_factor_what_lies_in_a_plane_and_envelopes_a_room(monkeypatch):

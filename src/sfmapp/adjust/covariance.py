@@ -232,6 +232,13 @@ def gauge_of(
 ) -> tuple[Array, Array]:
     """Directions (k, N) that the information leaves open among the similarities, and their constraints (k, N);
     ``has_factors``: others than reprojections and priors of intrinsics had a part in it."""
+    basis, constraint = similarities_of(problem, used, scale)
+    return open_directions(basis, constraint, basis @ information @ basis.T, has_factors=has_factors)
+
+
+def similarities_of(problem: Problem, used: Mask, scale: Array) -> tuple[Array, Array]:
+    """What similarities of the world, of which a baseline tells the size, do to the unknowns that are used (k, N), and
+    their constraints (k, N), in lengths that a diagonal scale (N,) gives; none where no pose varies."""
     poses = np.flatnonzero(problem.pose_block >= 0)
     if len(poses) == 0:
         return np.zeros((0, len(scale))), np.zeros((0, len(scale)))
@@ -244,8 +251,13 @@ def gauge_of(
     _add_point_motion(problem, used, basis)
     norm = np.sqrt((basis**2 * scale).sum(1))
     norm[norm == 0] = 1.0
-    basis, constraint = basis / norm[:, None], constraint / norm[:, None]
-    values, vectors = np.linalg.eigh(basis @ information @ basis.T)
+    return basis / norm[:, None], constraint / norm[:, None]
+
+
+def open_directions(basis: Array, constraint: Array, told: Array, *, has_factors: bool) -> tuple[Array, Array]:
+    """Those of a basis (k, N), and their constraints, of which the information tells nothing: told (k, k) is its
+    product with the basis from both sides; ``has_factors`` as of :func:`gauge_of`."""
+    values, vectors = np.linalg.eigh(told)
     open_ = vectors[:, values < (_NULL_BESIDE_FACTORS if has_factors else _NULL)].T
     return open_ @ basis, open_ @ constraint
 

@@ -1,17 +1,11 @@
-"""The Cholesky factor of sparse systems in fronts, and those entries of the inverse that lie where it has its own.
+"""In which order the blocks of a sparse system are eliminated, and which of them together.
 
 Blocks are eliminated in an order of least degree; those that meet the same blocks behind them go together, in a front:
 a small full matrix over them and what they meet, which takes over what the fronts below it leave (Duff and Reid, "The
 multifrontal solution of indefinite sparse symmetric linear systems", 1983). All the work is products of full matrices.
-The inverse is made from the last front to the first, each from the one above it, and nowhere else (Takahashi, Fagan and
-Chen, "Formation of a sparse bus impedance matrix", 1973; Golub and Plemmons, "Large-scale geodetic least-squares
-adjustment", 1980).
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,15 +102,6 @@ def _children_first(above: Ints) -> Ints:
     return np.array(out[::-1], np.int64)
 
 
-def order_of(matrix: Any, block_of: Ints) -> FrontOrder:
-    """Of a symmetric sparse matrix (N, N) of scipy; block_of (N,) ascending, the block of each unknown."""
-    from scipy import sparse
-
-    entries, num_blocks = sparse.coo_matrix(matrix), int(block_of.max(initial=-1)) + 1
-    pairs = np.unique(block_of[entries.row].astype(np.int64) * num_blocks + block_of[entries.col])
-    return FrontOrder(num_blocks, *np.divmod(pairs, num_blocks))
-
-
 def substitute(unknowns: list[Ints], num_own: list[int], inverse: list[Array], below: list[Array], x: Array) -> None:
     """Solve in place for right-hand sides x (N, ...) by a factor: of each front its unknowns and how many of them, the
     first, it eliminates, the inverse of the factor over these, and what is below it."""
@@ -127,79 +112,3 @@ def substitute(unknowns: list[Ints], num_own: list[int], inverse: list[Array], b
         x[places[k:]] -= rest @ own
     for places, k, upper, rest in reversed(fronts):
         x[places[:k]] = upper.T @ (x[places[:k]] - rest.T @ x[places[k:]])
-
-
-class FrontFactor:
-    """The factor of a symmetric sparse matrix, by fronts."""
-
-    def __init__(self, matrix: Any, block_of: Ints, order: FrontOrder) -> None:
-        """matrix: (N, N), of scipy by columns. block_of: (N,) ascending, the block of each unknown.
-
-        Raises:
-            LinAlgError: it is not positive definite.
-        """
-        self.order = order
-        first = np.searchsorted(block_of, np.arange(len(order.position) + 1))
-        self.unknowns, self.num_own = order.unknowns(first[:-1], np.diff(first))
-        self._rank = np.empty(len(block_of), np.int64)  # of each unknown in the order of elimination
-        self._rank[np.concatenate([u[:k] for u, k in zip(self.unknowns, self.num_own, strict=True)])] = np.arange(
-            len(block_of)
-        )
-        self._inverse: list[Array] = []
-        self._below: list[Array] = []
-        self._factor(matrix)
-
-    def _places(self, front: int, unknowns: Ints) -> Ints:
-        """Where unknowns are in a front."""
-        return np.searchsorted(self._rank[self.unknowns[front]], self._rank[unknowns])
-
-    def _factor(self, matrix: Any) -> None:
-        left: list[list[tuple[Ints, Array]]] = [[] for _ in self.unknowns]
-        for f, (unknowns, k) in enumerate(zip(self.unknowns, self.num_own, strict=True)):
-            own, ranks = unknowns[:k], self._rank[unknowns]
-            front = np.zeros((len(unknowns), len(unknowns)))
-            part = matrix[:, own]
-            row, column = part.indices.astype(np.int64), np.repeat(np.arange(k), np.diff(part.indptr))
-            is_here = self._rank[row] >= ranks[0]
-            front[np.searchsorted(ranks, self._rank[row[is_here]]), column[is_here]] = part.data[is_here]
-            for child_unknowns, update in left[f]:
-                at = self._places(f, child_unknowns)
-                front[np.ix_(at, at)] += update
-            left[f] = []
-            lower = np.linalg.cholesky(front[:k, :k])
-            inverse = np.linalg.inv(lower)
-            below = front[k:, :k] @ inverse.T
-            self._inverse.append(inverse)
-            self._below.append(below)
-            if len(below):
-                left[self.order.parent[f]].append((unknowns[k:], front[k:, k:] - below @ below.T))
-
-    def solve(self, right: Array) -> Array:
-        """(N, ...) of a right-hand side (N, ...)."""
-        x = np.array(right, np.float64)
-        substitute(self.unknowns, self.num_own, self._inverse, self._below, x)
-        return x
-
-    def inverse(self) -> Iterator[tuple[Ints, int, Array]]:
-        """Of each front, from the last to the first, its unknowns, how many of them are its own, which come first, and
-        the inverse over them."""
-        num_waiting = np.bincount(self.order.parent[self.order.parent >= 0], minlength=len(self.unknowns))
-        made: dict[int, Array] = {}
-        for f in range(len(self.unknowns) - 1, -1, -1):
-            unknowns, k, parent = self.unknowns[f], self.num_own[f], int(self.order.parent[f])
-            full = np.empty((len(unknowns), len(unknowns)))
-            own, inverse = full[:k, :k], self._inverse[f]
-            own[:] = inverse.T @ inverse
-            if parent >= 0:
-                at = self._places(parent, unknowns[k:])
-                full[k:, k:] = made[parent][np.ix_(at, at)]
-                through = self._below[f] @ inverse
-                full[k:, :k] = -full[k:, k:] @ through
-                full[:k, k:] = full[k:, :k].T
-                own -= through.T @ full[k:, :k]
-                num_waiting[parent] -= 1
-                if num_waiting[parent] == 0:
-                    del made[parent]
-            if num_waiting[f]:
-                made[f] = full
-            yield unknowns, k, full

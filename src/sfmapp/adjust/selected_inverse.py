@@ -1,10 +1,10 @@
 """Covariances of many images and their cameras: those blocks of the inverse of a sparse system that are wanted.
 
 The reduced system of a survey is sparse, its inverse is full: of a thousand images half a gigabyte, of which the blocks
-on the diagonal are a thousandth. Fronts (:mod:`sfmapp.adjust.fronts`) make the entries of the inverse where the factor
-has its own, and nothing else. What is open is held by two images alone, which keeps the system sparse, and the blocks
-are then moved to the gauge of inner constraints (an S-transformation: Baarda 1973), for which as many columns are
-solved as there are open directions.
+on the diagonal are a thousandth. Fronts (:mod:`sfmapp.adjust.front_system`) make the entries of the inverse where the
+factor has its own, and nothing else. What is open is held by two images alone, each within itself, which keeps the
+system as sparse as it is, and the blocks are then moved to the gauge of inner constraints (an S-transformation: Baarda
+1973), for which as many columns are solved as there are open directions.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from sfmapp.adjust.covariance import (
     Covariances,
     block_covariances,
     constrained_columns,
-    gauge_of,
+    open_directions,
     reduced_matrix,
     residual_variance,
+    similarities_of,
     upper_tiles,
 )
-from sfmapp.adjust.fronts import FrontFactor, order_of
+from sfmapp.adjust.front_system import FrontSystem, flops_of_fronts
+from sfmapp.adjust.fronts import FrontOrder
 from sfmapp.adjust.linear import is_sparse, one_blas_thread
 from sfmapp.adjust.options import AdjustOptions
-from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
+from sfmapp.adjust.problem import EVERYTHING, Varying
 from sfmapp.adjust.solver import Engine, make_engine
 from sfmapp.camera.camera import Camera
-from sfmapp.geometry import rigid3
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -40,8 +41,11 @@ Ints = NDArray[np.int64]
 # Columns that are solved for besides, and how far they may be off: of correct ones rounding leaves 1e-6 where positions
 # hold the whole as loosely as those of a phone do.
 _NUM_CHECKED, _MAX_OFF = 4, 1e-3
-# Entries of a factor: of a survey of 1,000 images two to five million; where all meet all, this many take minutes.
-_MAX_ENTRIES = 15_000_000
+# Multiplications and additions of the factor; its inverse takes twice as many. A walk of 3,000 views through a town
+# takes 3.5e10, some seconds; so much as this and more take half a minute, and 1,000 images that all meet all.
+_MAX_FLOPS = 2.5e11
+# An image holds the open directions in which it moves by more than this share of how it moves in others.
+_HOLDS = 1e-6
 
 
 def selected_covariances(
@@ -73,7 +77,7 @@ def selected_covariances(
         found = _inverse_blocks(engine)
     if found is None:
         return None
-    (blocks, beside), num_gauge = found
+    blocks, beside, num_gauge = found
     covariances = block_covariances(
         reconstruction, engine.problem, variance * blocks, variance * beside, float(np.sqrt(variance))
     )
@@ -90,133 +94,119 @@ def covariance_of_functions(engine: Engine, rows: Array) -> Array | None:
     Returns:
         None where something is open.
     """
-    used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
-    wanted, none = rows[:, used], np.zeros((0, int(used.sum())))
     if engine.solver in ("gtsam", "fronts") or (engine.solver == "envelope" and is_sparse(engine.fill)):
         engine.linearize(0.0, map)
-        matrix = _sparse_system(engine, used)
-        root = 1.0 / np.sqrt(matrix.diagonal())
-        factor = _factored(matrix.multiply(root[:, None]).multiply(root[None]).tocsc(), used)
+        factor = _factored(engine, *upper_tiles(engine))
         if factor is not None:
-            found: Array = (wanted * root) @ factor.solve((wanted * root).T)
+            found: Array = rows @ factor.substitute(rows.T)
             return found
     engine.linearize(0.0, map)  # anew: the other way has added to it
+    used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
+    wanted, none = rows[:, used], np.zeros((0, int(used.sum())))
     information = reduced_matrix(engine)[np.ix_(used, used)]
     columns = constrained_columns(information, engine.diagonal[used], none, none, wanted.T)
     return None if columns is None else wanted @ columns
 
 
-def _inverse_blocks(engine: Engine) -> tuple[Array, int] | None:
-    """(2, B, 8, 8) blocks of the inverse of the undamped reduced system, on the diagonal and each with the one behind
-    it, and how many directions only the inner constraints hold."""
-    used = (np.arange(8) < engine.problem.block_dim[:, None]).ravel()
-    matrix = _sparse_system(engine, used)
-    root = 1.0 / np.sqrt(matrix.diagonal())
-    basis, constraint = gauge_of(engine.problem, used, matrix, matrix.diagonal(), has_factors=engine.extras is not None)
-    scaled = matrix.multiply(root[:, None]).multiply(root[None])
+def _inverse_blocks(engine: Engine) -> tuple[Array, Array, int] | None:
+    """(B, 8, 8) blocks of the inverse of the undamped reduced system on its diagonal, (B, 8, 8) of each that goes on in
+    the one behind it with that, and how many directions only the inner constraints hold."""
+    problem, num = engine.problem, engine.problem.num_blocks
+    used = (np.arange(8) < problem.block_dim[:, None]).ravel()
+    a, b, tiles = upper_tiles(engine)
+    own = np.flatnonzero(a == b)
+    diagonal = np.einsum("nii->ni", tiles[own]).ravel()
+    narrow = similarities_of(problem, used, diagonal[used])
+    basis, constraint = (np.zeros((len(rows), num * 8)) for rows in narrow)
+    basis[:, used], constraint[:, used] = narrow
+    told = _from_both_sides(a, b, tiles, basis)
+    basis, constraint = open_directions(basis, constraint, told, has_factors=engine.extras is not None)
     if len(basis):
-        # in the units of the scaled unknowns; two images that are far apart hold what is open
-        basis, constraint = basis / root, constraint * root
-        scaled = scaled + _held_by_two(engine.problem, used, basis)
-    factor = _factored(scaled.tocsc(), used)
+        _hold(problem.pose_block[problem.pose_block >= 0].astype(np.int64), basis, diagonal, tiles, own)
+    factor = _factored(engine, a, b, tiles)
     if factor is None:
         return None
-    blocks, diagonal = _gathered(factor, used)
-    if not _agrees(factor, diagonal):
+    wide = problem.second_block >= 0
+    first = np.concatenate([np.arange(num), problem.camera_block[wide]])
+    second = np.concatenate([np.arange(num), problem.second_block[wide]])
+    found = factor.inverse_tiles(first, second)
+    if not _agrees(factor, found[:num], problem.block_dim):
         return None
     if len(basis):
-        blocks = _in_inner_gauge(blocks, factor, basis, constraint, used)
-    full_root = np.zeros(len(used))
-    full_root[used] = root
-    per_block = full_root.reshape(-1, 8)
-    behind = np.roll(per_block, -1, axis=0)
-    return blocks * per_block[:, :, None] * np.stack([per_block, behind])[:, :, None, :], len(basis)
+        found = _in_inner_gauge(found, factor, basis, constraint, first, second)
+    beside = np.zeros((num, 8, 8))
+    beside[first[num:]] = found[num:]
+    return found[:num], beside, len(basis)
 
 
-def _factored(scaled: Any, used: NDArray[np.bool_]) -> FrontFactor | None:
-    """The factor of a symmetric sparse matrix over the unknowns that are used; None where it is singular, or too
-    full."""
-    _, block_of = np.unique(np.flatnonzero(used) // 8, return_inverse=True)
-    order = order_of(scaled, block_of)
-    if order.num_entries * (len(block_of) / (block_of[-1] + 1)) ** 2 > _MAX_ENTRIES:
-        return None
-    try:
-        return FrontFactor(scaled, block_of, order)
-    except np.linalg.LinAlgError:  # singular
-        return None
-
-
-def _held_by_two(problem: Problem, used: NDArray[np.bool_], basis: Array) -> Any:
-    """What is to be added to a system (N, N) for two images to hold the open directions (k, N), as a sparse matrix."""
+def _from_both_sides(a: Ints, b: Ints, tiles: Array, rows: Array) -> Array:
+    """(k, k) product of rows (k, B * 8) from both sides with what upper tiles are of, as of :func:`upper_tiles`."""
     from scipy import sparse
 
-    images = np.flatnonzero(problem.pose_block >= 0)
-    centers = rigid3.center(problem.poses[images])
-    far = int(np.argmax(np.linalg.norm(centers - centers.mean(0), axis=1)))
-    other = int(np.argmax(np.linalg.norm(centers - centers[far], axis=1)))
-    is_holding = np.zeros(len(used), bool)
-    for i in (far, other):
-        is_holding[problem.pose_block[images[i]] * 8 + np.arange(6)] = True
-    holding = np.flatnonzero(is_holding[used])
-    rows, _ = np.linalg.qr(basis[:, holding].T)  # alike in all directions
-    row, column = np.meshgrid(holding, holding, indexing="ij")
-    size = int(used.sum())
-    return sparse.coo_matrix(((rows @ rows.T).ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+    num = rows.shape[1] // 8
+    halved = tiles.copy()
+    on_diagonal = a == b
+    halved[on_diagonal] = np.triu(tiles[on_diagonal]) * (1.0 - 0.5 * np.eye(8))
+    pointers = np.searchsorted(a, np.arange(num + 1))
+    upper = sparse.bsr_matrix((halved, b, pointers), shape=(num * 8, num * 8))
+    product: Array = rows @ (upper @ rows.T)
+    return product + product.T
+
+
+def _factored(engine: Engine, a: Ints, b: Ints, tiles: Array) -> FrontSystem | None:
+    """The factor of upper tiles as of :func:`upper_tiles`; None where they are singular, or it would cost too much."""
+    dim, num = engine.problem.block_dim, engine.problem.num_blocks
+    meets = np.flatnonzero(tiles.any(axis=(1, 2)) | (a == b))
+    order = engine.front_order or FrontOrder(num, a[meets], b[meets])
+    if flops_of_fronts(order, dim).sum() > _MAX_FLOPS:
+        return None
+    factor = FrontSystem(dim, a[meets] * num + b[meets], meets, order)
+    return factor if factor.factor(tiles.ravel()) else None
+
+
+def _hold(pose_blocks: Ints, basis: Array, diagonal: Array, tiles: Array, own: Ints) -> None:
+    """Let two images hold the open directions (k, B * 8), the one as many as it can alone and the other those that are
+    left: add to their own tiles, in place. Which two does not matter but for rounding.
+
+    Args:
+        pose_blocks: (n,) blocks of poses. diagonal: (B * 8,) of the system. own: (B,) tiles of blocks with themselves.
+    """
+    root = np.sqrt(diagonal.reshape(-1, 8)[pose_blocks, :6])
+    moves = basis.reshape(len(basis), -1, 8)[:, pose_blocks, :6].transpose(1, 0, 2) * root[:, None]
+    left = np.eye(len(basis))
+    while len(left):
+        turned, sizes, rows = np.linalg.svd(left @ moves, full_matrices=True)
+        image = int(np.argmax(sizes[:, -1]))
+        num_held = int((sizes[image] > _HOLDS * sizes[image, 0]).sum())
+        if sizes[image, 0] == 0.0:
+            return
+        rows = rows[image, :num_held] * root[image]
+        tiles[own[pose_blocks[image]], :6, :6] += rows.T @ rows
+        left = turned[image][:, num_held:].T @ left
 
 
 def _in_inner_gauge(
-    blocks: Array, factor: FrontFactor, basis: Array, constraint: Array, used: NDArray[np.bool_]
+    blocks: Array, factor: FrontSystem, basis: Array, constraint: Array, first: Ints, second: Ints
 ) -> Array:
-    """Blocks (2, B, 8, 8) of a covariance S with the open directions (k, N) held somehow, moved to where the
-    constraints (k, N) vanish: of P S P^T, with P = 1 - basis^T (constraint basis^T)^-1 constraint."""
-    crossed = factor.solve(constraint.T)
+    """Blocks (N, 8, 8), of first and second (N,), of a covariance S with the open directions (k, B * 8) held somehow,
+    moved to where the constraints (k, B * 8) vanish: of P S P^T, with P = 1 - basis^T (constraint basis^T)^-1
+    constraint."""
+    crossed = factor.substitute(constraint.T)
     turned = basis.T @ np.linalg.inv(constraint @ basis.T)
     # P S P^T = S - Y T^T - T Y^T + T W T^T with Y = S C^T, T = B^T (C B^T)^-1, W = C S C^T
-    left, right = np.zeros((2, len(used), len(basis)))
-    left[used], right[used] = crossed, turned
-    y, t = left.reshape(blocks.shape[1], 8, -1), right.reshape(blocks.shape[1], 8, -1)
-    y_behind, t_behind = (np.stack([x, np.roll(x, -1, axis=0)]).transpose(0, 1, 3, 2) for x in (y, t))
-    moved: Array = blocks - y @ t_behind - t @ y_behind + t @ (constraint @ crossed) @ t_behind
+    y, t = crossed.reshape(-1, 8, len(basis)), turned.reshape(-1, 8, len(basis))
+    y_second, t_second = y[second].transpose(0, 2, 1), t[second].transpose(0, 2, 1)
+    moved: Array = blocks - y[first] @ t_second - t[first] @ y_second + t[first] @ (constraint @ crossed) @ t_second
     return moved
 
 
-def _sparse_system(engine: Engine, used: NDArray[np.bool_]) -> Any:
-    """The reduced system over the unknowns that are used, as a symmetric matrix of scipy."""
-    from scipy import sparse
-
-    a, b, tiles = upper_tiles(engine)
-    on_diagonal = a == b
-    tiles[on_diagonal] = np.triu(tiles[on_diagonal])
-    at = np.arange(8)
-    row = np.broadcast_to(a[:, None, None] * 8 + at[:, None], tiles.shape)
-    column = np.broadcast_to(b[:, None, None] * 8 + at, tiles.shape)
-    size = len(used)
-    kept = used[row] & used[column] & (row <= column)
-    upper = sparse.csc_matrix((tiles[kept], (row[kept], column[kept])), shape=(size, size))
-    upper = upper[used][:, used]
-    return (upper + sparse.triu(upper, 1).T).tocsc()
-
-
-def _gathered(factor: FrontFactor, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """(2, B, 8, 8) blocks of the inverse on its diagonal, and each with the one behind it, zeros where the factor has
-    none; and the diagonal (N,)."""
-    number = np.flatnonzero(used)
-    blocks, diagonal = np.zeros((2, len(used) // 8, 8, 8)), np.empty(len(number))
-    for unknowns, num_own, inverse in factor.inverse():
-        diagonal[unknowns[:num_own]] = inverse.diagonal()[:num_own]
-        row, column = number[unknowns], number[unknowns[:num_own]]
-        apart = column // 8 - row[:, None] // 8
-        for k, turned in ((0, False), (1, False), (1, True)):
-            i, j = np.nonzero(apart == (-k if turned else k))
-            first, second = (column[j], row[i]) if turned else (row[i], column[j])
-            blocks[k, first // 8, first % 8, second % 8] = inverse[i, j]
-    return blocks, diagonal
-
-
-def _agrees(factor: FrontFactor, diagonal: Array) -> bool:
-    """Whether some entries are those that the factor itself solves for."""
-    chosen = np.linspace(0, len(diagonal) - 1, _NUM_CHECKED).astype(int)
-    right = np.zeros((len(diagonal), len(chosen)))
-    right[chosen, np.arange(len(chosen))] = 1.0
-    solved = factor.solve(right)[chosen, np.arange(len(chosen))]
-    return bool(np.allclose(solved, diagonal[chosen], rtol=_MAX_OFF))
+def _agrees(factor: FrontSystem, blocks: Array, block_dim: Ints) -> bool:
+    """Whether some entries on the diagonal of the inverse, of blocks (B, 8, 8), are those that the factor itself solves
+    for."""
+    chosen = np.linspace(0, len(blocks) - 1, _NUM_CHECKED).astype(int)
+    columns = np.arange(len(chosen))
+    right = np.zeros((len(blocks), 8, len(chosen)))
+    last = block_dim[chosen] - 1
+    right[chosen, last, columns] = 1.0
+    solved = factor.substitute(right.reshape(-1, len(chosen))).reshape(right.shape)[chosen, last, columns]
+    return bool(np.allclose(solved, blocks[chosen, last, last], rtol=_MAX_OFF))

@@ -51,6 +51,7 @@ from sfmapp.events import Events
 from sfmapp.scene.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
+    from sfmapp.adjust.fronts import FrontOrder
     from sfmapp.adjust.iterative import IterativeSystem
 
 Array = NDArray[np.float64]
@@ -208,6 +209,7 @@ class Engine:
         self.solver: SolverName = "tiles"
         self.fill = 1.0
         self.system: ReducedSystem | None = None
+        self.front_order: FrontOrder | None = None
         self.rows = np.empty((images, 12))
         kernels.fill_rows(p.poses, p.image_pose, p.image_mount, p.mounts, self.rows)
         self.meetings = Meetings(p.block_dim, *find_meetings(p.points, p.images(self.rows), p.lenses, blocks))
@@ -250,7 +252,7 @@ class Engine:
                 self.solver, order = "iterative", None
                 keys = keys[is_of_cluster(*np.divmod(keys, blocks))]
             elif isinstance(order, FrontOrder):
-                self.solver = "fronts"
+                self.solver, self.front_order = "fronts", order
         self.has_all_tiles = is_small or self.solver == "tiles"
         self.tile_keys = np.arange(blocks * blocks) if self.has_all_tiles else keys
         numbers = keys if self.has_all_tiles else np.arange(len(keys))
