@@ -251,7 +251,7 @@ class Points:
         """(P,) mean length of the residuals of those observations in pixels; NaN where there are none."""
         model, used = self.reconstruction, self.reconstruction.obs_is_inlier
         track, num_tracks = model.tracks.obs_track_idx[used], model.tracks.num_tracks
-        total = np.bincount(track, np.linalg.norm(model.residuals_px()[used], axis=1), num_tracks)[self.ids]
+        total = np.bincount(track, model.errors_px()[used], num_tracks)[self.ids]
         count = self.num_images
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 

@@ -190,7 +190,7 @@ def model_from_reconstruction(reconstruction: Reconstruction, keypoints: Keypoin
 def _mean_error_px(reconstruction: Reconstruction, used: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(T,) mean length of the residuals of each track; -1, COLMAP's sign for unknown, where there is none."""
     tracks = reconstruction.tracks
-    lengths = np.linalg.norm(reconstruction.residuals_px()[used], axis=1)
+    lengths = reconstruction.errors_px()[used]
     track_idx = tracks.obs_track_idx[used]
     total = np.bincount(track_idx, lengths, tracks.num_tracks)
     count = np.bincount(track_idx, minlength=tracks.num_tracks)

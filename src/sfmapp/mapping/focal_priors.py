@@ -171,7 +171,7 @@ def _support(results: Sequence[list[Reconstruction]]) -> list[int]:
     for models in results:
         agrees = np.zeros(models[0].tracks.num_observations if models else 0, bool)
         for model in models:
-            agrees |= model.obs_is_inlier & (np.linalg.norm(model.residuals_px(), axis=1) <= limit)
+            agrees |= model.obs_is_inlier & (model.errors_px() <= limit)
         counts.append(int(agrees.sum()))
     return counts
 

@@ -102,7 +102,7 @@ def hold_out(
         adjust_bundle(trial, options, varying=Varying(points=fit, images=free_images), prior_cameras=priors)
         nothing = np.zeros(len(trial.image_names), bool), np.zeros(len(trial.cameras), bool)
         adjust_bundle(trial, held, varying=Varying(points=judge, images=nothing[0], cameras=nothing[1]))
-        lengths.append(np.linalg.norm(trial.residuals_px(), axis=1))
+        lengths.append(trial.errors_px())
     tracks = model.tracks
     # a point that two images see follows nearly any pose
     size = np.bincount(tracks.obs_track_idx[model.obs_is_inlier], minlength=tracks.num_tracks)

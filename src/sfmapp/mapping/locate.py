@@ -347,7 +347,7 @@ def _adjusted(
             around, mapper.robust(closing), varying=varying, prior_cameras=priors, noise_px=noise.robust_px
         ).optimize()
         obs = around.tracks.observations_of_image(query)
-        lengths = np.linalg.norm(around.residuals_px(), axis=1)
+        lengths = around.errors_px()
         around.obs_is_inlier[obs] = lengths[obs] <= limit  # False for NaN
     graph = FactorGraph(around, closing, varying=varying, prior_cameras=priors, noise_px=noise.sigma_px)
     covariance = _in_frame_of_others(graph, around, query)

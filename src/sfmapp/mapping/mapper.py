@@ -51,8 +51,8 @@ MIN_NOISE_PX = 0.02
 # that are wanted are made.
 MAX_DENSE_IMAGES = 200
 # What a growing model looks like is told when so large a share of its images is new, as telling takes all observations:
-# at every step up to a hundred images.
-TOLD_SHARE = 0.01
+# at every step up to fifty images.
+TOLD_SHARE = 0.02
 
 
 @dataclass(kw_only=True)

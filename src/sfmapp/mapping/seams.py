@@ -329,7 +329,7 @@ def _crossing(a: Submap, b: Submap, common: Common, sim: Array, options: Mapping
         model.point_xyz[:] = np.nan
         held = holder.model.point_xyz[holder.places_of_tracks(common.track_idx)]
         model.point_xyz[at] = similarity.apply(viewer_from_holder, held)
-        length = np.linalg.norm(model.residuals_px(), axis=1)
+        length = model.errors_px()
         only = model.is_registered.copy()
         only[viewer.places_of_images(common.image_idx)] = False
         obs = only[model.tracks.obs_image_idx] & model.is_triangulated[model.tracks.obs_track_idx]

@@ -62,7 +62,7 @@ def residual_scale_px(reconstruction: Reconstruction, at_least: float = math.nan
         reconstruction: what is measured.
         at_least: returned where the residuals are shorter, or where there is none.
     """
-    lengths = np.linalg.norm(reconstruction.residuals_px()[reconstruction.obs_is_inlier], axis=1)
+    lengths = reconstruction.errors_px()[reconstruction.obs_is_inlier]
     lengths = lengths[np.isfinite(lengths)]
     if not len(lengths):
         return at_least

@@ -193,7 +193,7 @@ def _focal(camera: Camera, params: Array) -> float:
 
 def _classify(model: Reconstruction, candidates: Mask) -> None:
     """Which of the candidates agree with the model, in place; points keep their places, to be asked again."""
-    errors = np.linalg.norm(model.residuals_px(), axis=1)
+    errors = model.errors_px()
     limit = max(_LIMIT_SIGMAS * residual_scale_px(model), _LIMIT_PX)
     agrees = candidates & (errors <= limit)  # NaN does not
     track = model.tracks.obs_track_idx

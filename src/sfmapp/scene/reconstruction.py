@@ -160,10 +160,16 @@ class Reconstruction:
         )
         return out
 
+    def errors_px(self) -> NDArray[np.float64]:
+        """(O,) lengths of residuals in pixels, NaN as theirs."""
+        x, y = self.residuals_px().T
+        lengths: NDArray[np.float64] = np.sqrt(x * x + y * y)  # several times as fast as norms of rows of two
+        return lengths
+
     def summary(self) -> ModelSummary:
         """Counts and errors."""
         used = self.obs_is_inlier
-        errors = np.linalg.norm(self.residuals_px()[used], axis=1)
+        errors = self.errors_px()[used]
         num_points = int(self.is_triangulated.sum())
         num_registered = int(self.is_registered.sum())
         return ModelSummary(

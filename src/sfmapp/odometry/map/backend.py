@@ -128,7 +128,7 @@ def _add_turns(graph: FactorGraph, job: Job, num_sensors: int) -> None:
 
 def classify(model: Reconstruction, num_elsewhere: NDArray[np.int64]) -> float:
     """Mark the observations that agree with the model and drop points without support; returns sigma in pixels."""
-    error = np.linalg.norm(model.residuals_px(), axis=1)
+    error = model.errors_px()
     used = error[model.obs_is_inlier & np.isfinite(error)]
     sigma = sigma_of_lengths(used) if len(used) else 1.0
     limit = float(np.clip(_OUTLIER_SIGMAS * sigma, *_OUTLIER_RANGE_PX))

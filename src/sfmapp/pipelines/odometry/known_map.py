@@ -84,7 +84,7 @@ def check_observations(known: KnownMap) -> None:
     if not len(chosen):
         return
     # what lies behind its camera has no residual
-    off = np.nan_to_num(np.linalg.norm(model.residuals_px()[chosen], axis=1), nan=np.inf)
+    off = np.nan_to_num(model.errors_px()[chosen], nan=np.inf)
     image = model.tracks.obs_image_idx[chosen]
     limit = RelocalizeOptions().error_px(model.cameras[model.image_camera_idx[image[0]]])
     middle = float(np.median(off))
