@@ -325,9 +325,7 @@ def test_a_tile_holds_the_products_and_marks_those_above_the_bounds(shift: int, 
 def _best(a, packed, best1, best2):  # type: ignore[no-untyped-def]
     for row in range(0, len(a), dots.ROWS):
         for group in range(0, len(packed), dots.GROUPS):
-            dots.tile_of_best(
-                a, packed, row, group, best1[row : row + dots.ROWS], best2, row + 10 + dots.BLOCK * (group + 2)
-            )
+            dots.tile_of_best(a, packed, row, group, best1, best2, row, row + 10 + dots.BLOCK * (group + 2))
 
 
 @numba.njit

@@ -33,6 +33,10 @@ from sfmapp.simd.dots import (
 Ints = NDArray[np.int32]
 # descriptors as the tile reads them
 Packed = NDArray[np.integer]
+# Rows of image 1 that are compared with one pair of groups after the other: they, what they have found and that pair
+# take 20 kB of a first cache, of which processors have 32 and more. Row pair by row pair, all groups of a block, 64 kB,
+# would come from the second cache for each.
+STRIP = 32
 
 
 class Best(NamedTuple):
@@ -67,36 +71,43 @@ class TileRoom(NamedTuple):
 def _scan(
     a: Packed, packed: Packed, rows: Best, columns: Best, row_span: tuple[int, int], group_span: tuple[int, int]
 ) -> None:
-    """Products of a span of rows with one of groups, by blocks of BLOCK x BLOCK: half of one stays in the first cache
-    while the other passes by."""
-    best1, best2 = np.empty((ROWS, 2, LANES), np.int32), np.empty((BLOCK // LANES, 2, LANES), np.int32)
+    """Products of a span of rows with one of groups, by blocks of BLOCK x BLOCK, and in these by strips of rows: a
+    strip and what it has found stay in the first cache while the groups of the block pass by, once for all its rows."""
+    best1, best2 = np.empty((STRIP, 2, LANES), np.int32), np.empty((BLOCK // LANES, 2, LANES), np.int32)
     for first_group in range(group_span[0], group_span[1], BLOCK // LANES):
         last_group = min(first_group + BLOCK // LANES, group_span[1])
         for first_row in range(row_span[0], row_span[1], BLOCK):
             best2[:] = 0
-            for row in range(first_row, min(first_row + BLOCK, row_span[1]), ROWS):
+            last_row = min(first_row + BLOCK, row_span[1])
+            for strip in range(first_row, last_row, STRIP):
                 best1[:] = 0
+                end = min(strip + STRIP, last_row)
                 for group in range(first_group, last_group, GROUPS):
-                    tile_of_best(a, packed, row, group, best1, best2, row - first_row + BLOCK * (group - first_group))
-                for r in range(ROWS):
-                    first, second = two_largest_lanes(best1, r)
-                    _merge_block(rows, row + r, first, second, first_group * LANES)
+                    column = BLOCK * (group - first_group)
+                    for row in range(strip, end, ROWS):
+                        tile_of_best(a, packed, row, group, best1, best2, row - strip, row - first_row + column)
+                for row in range(strip, end):
+                    first, second = two_largest_lanes(best1, row - strip)
+                    _merge_block(rows.first, rows.second, rows.partner, row, first, second, first_group * LANES)
             for group in range(first_group, last_group):
+                of_group = best2[group - first_group]
                 for q in range(LANES):
-                    of_column = best2[group - first_group, :, q]
-                    _merge_block(columns, group * LANES + q, of_column[0], of_column[1], first_row)
+                    _merge_block(
+                        columns.first, columns.second, columns.partner, group * LANES + q, of_group[0, q],
+                        of_group[1, q], first_row,
+                    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _merge_block(best: Best, i: int, first: int, second: int, start: int) -> None:
+def _merge_block(best1: Ints, best2: Ints, partner: Ints, i: int, first: int, second: int, start: int) -> None:
     """Enter the two largest of a block, which begins with partner ``start``, into those of i; see ``tile_of_best``."""
     value = first >> 8
-    if value > best.first[i]:
-        best.second[i] = max(best.first[i], second >> 8)
-        best.first[i] = value
-        best.partner[i] = start + BLOCK - 1 - (first & (BLOCK - 1))
-    elif value > best.second[i]:
-        best.second[i] = value
+    if value > best1[i]:
+        best2[i] = max(best1[i], second >> 8)
+        best1[i] = value
+        partner[i] = start + BLOCK - 1 - (first & (BLOCK - 1))
+    elif value > best2[i]:
+        best2[i] = value
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

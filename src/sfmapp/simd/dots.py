@@ -161,7 +161,9 @@ def _keep_two(builder: Any, two: tuple[Any, Any], others: tuple[Any, ...]) -> tu
 
 
 @intrinsic
-def tile_of_best(typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best1: Any, best2: Any, at: Any) -> Any:
+def tile_of_best(
+    typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best1: Any, best2: Any, row_at: Any, at: Any
+) -> Any:
     """Enter products of rows ``row..row + ROWS`` of a with groups ``group..group + GROUPS`` of packed into the two
     largest of each row and column of a block of BLOCK by BLOCK, without a branch.
 
@@ -170,8 +172,9 @@ def tile_of_best(typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best
 
     Args:
         a, packed: see :func:`tile`; no number above 255.
-        best1: (ROWS, 2, LANES) int32, the two largest of each row among the columns of each lane.
+        best1: (N, 2, LANES) int32, the two largest of each row among the columns of each lane.
         best2: (BLOCK / LANES, 2, LANES) int32, the two largest of each column of the block.
+        row_at: position of row in best1.
         at: position of row and group within the block, one after the other in an int64: row + BLOCK * group.
     """
 
@@ -180,8 +183,8 @@ def tile_of_best(typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best
         p_best1, p_best2 = (
             builder.bitcast(data(context, builder, signature, args, k), I32.as_pointer()) for k in (4, 5)
         )
-        row_at = builder.trunc(builder.and_(args[6], int64(BLOCK - 1)), I32)
-        group_at = builder.udiv(args[6], int64(BLOCK))
+        in_block = builder.trunc(builder.and_(args[7], int64(BLOCK - 1)), I32)
+        group_at = builder.udiv(args[7], int64(BLOCK))
 
         def places(base: Any, n: Any) -> list[Any]:
             first = builder.mul(n, int64(2 * LANES))
@@ -198,9 +201,9 @@ def tile_of_best(typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best
             for g in range(GROUPS)
         ]
         for r, slots in enumerate(totals):
-            of_row = places(p_best1, int64(r))
+            of_row = places(p_best1, builder.add(args[6], int64(r)))
             two: Any = tuple(load(builder, place, _SUMS, 4) for place in of_row)
-            row_id = splat(builder, builder.sub(ir.Constant(I32, BLOCK - 1 - r), row_at), _SUMS)
+            row_id = splat(builder, builder.sub(ir.Constant(I32, BLOCK - 1 - r), in_block), _SUMS)
             for g, slot in enumerate(slots):
                 raised = builder.shl(builder.load(slot), constant(_SUMS, 8))
                 two = _keep_two(builder, two, (builder.or_(raised, column_ids[g]),))
@@ -212,7 +215,7 @@ def tile_of_best(typingctx: Any, a: Any, packed: Any, row: Any, group: Any, best
                 store(builder, vector, place, 4)
         return context.get_dummy_value()
 
-    return types.void(a, packed, row, group, best1, best2, at), codegen
+    return types.void(a, packed, row, group, best1, best2, row_at, at), codegen
 
 
 @intrinsic
