@@ -6,7 +6,7 @@ do the held parameters, once freed and fitted to half of the tracks, explain the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,6 +80,7 @@ def hold_out(
     free: AdjustOptions,
     every: int = 2,
     held_images: NDArray[np.bool_] | None = None,
+    is_worth_judging: Callable[[Reconstruction], bool] | None = None,
 ) -> HeldOut:
     """Adjust with parameters held and free to a share of the tracks, and judge both by as many others.
 
@@ -89,20 +90,25 @@ def hold_out(
         held, free: options of the two adjustments.
         every: the share is one in so many.
         held_images: (I,) bool, whose poses are held in the one and free in the other; None: all are free in both.
+        is_worth_judging: asked of ``freed`` when it is adjusted. Where it says no, the other adjustments are left out,
+            and nothing was found; None: it always is.
     """
     number = np.arange(model.tracks.num_tracks) % every
     fit, judge = model.is_triangulated & (number == 0), model.is_triangulated & (number == every // 2)
     if min(fit.sum(), judge.sum()) < MIN_TRACKS:
         return HeldOut(1.0, 0.0, model)
+    nothing = np.zeros(len(model.image_names), bool)
+    priors, images = list(freed.cameras), None if held_images is None else ~held_images
+    adjust_bundle(freed, free, varying=Varying(points=fit), prior_cameras=priors)
+    if is_worth_judging is not None and not is_worth_judging(freed):
+        return HeldOut(1.0, 0.0, freed)
+    trial = model.copy()
+    adjust_bundle(trial, held, varying=Varying(points=fit, images=images))
     lengths = []
-    images = None if held_images is None else ~held_images
-    for trial, options, priors, free_images in (
-        (model.copy(), held, None, images), (freed, free, list(freed.cameras), None)
-    ):  # fmt: skip
-        adjust_bundle(trial, options, varying=Varying(points=fit, images=free_images), prior_cameras=priors)
-        nothing = np.zeros(len(trial.image_names), bool), np.zeros(len(trial.cameras), bool)
-        adjust_bundle(trial, held, varying=Varying(points=judge, images=nothing[0], cameras=nothing[1]))
-        lengths.append(trial.errors_px())
+    for each in (trial, freed):
+        cameras = np.zeros(len(each.cameras), bool)
+        adjust_bundle(each, held, varying=Varying(points=judge, images=nothing, cameras=cameras))
+        lengths.append(each.errors_px())
     tracks = model.tracks
     # a point that two images see follows nearly any pose
     size = np.bincount(tracks.obs_track_idx[model.obs_is_inlier], minlength=tracks.num_tracks)
@@ -236,9 +242,10 @@ def _cut_photographs(mapped: Mapped, model: Reconstruction) -> Contradiction | N
         distortion_sigma=CUT_DISTORTION_SIGMA / noise,
     )  # fmt: skip
     every = max(2, int(model.is_triangulated.sum()) // max(CUT_TRACKS, CUT_TRACKS // 20 * len(registered)))
-    found = hold_out(model, robust, freed, free, every)
-    offsets = [_center_offset(freed.cameras[i]) for i in registered]
-    offset = float(np.median(offsets))
+    found = hold_out(
+        model, robust, freed, free, every, is_worth_judging=lambda fitted: _center_offset(fitted) >= CUT_OFFSET
+    )
+    offset = _center_offset(freed)
     if not (found.ratio <= CUT_RATIO and found.improved_share >= CLEAR_IMAGES and offset >= CUT_OFFSET):
         return None
     spread, turn = difference(model, freed)
@@ -276,10 +283,12 @@ def _one_lens_cut_differently(model: Reconstruction, noise: float) -> Reconstruc
     return freed
 
 
-def _center_offset(camera: Camera) -> float:
-    """Distance of the principal point from the middle as a share of the longer side."""
-    off = camera.k_matrix[:2, 2] - [camera.width / 2, camera.height / 2]
-    return float(np.linalg.norm(off) / max(camera.width, camera.height))
+def _center_offset(model: Reconstruction) -> float:
+    """Median distance of the principal points of the registered images from the middle, as a share of the longer side;
+    each image has a camera of its own."""
+    cameras = [model.cameras[i] for i in model.registered_idx]
+    off = [camera.k_matrix[:2, 2] - [camera.width / 2, camera.height / 2] for camera in cameras]
+    return float(np.median([np.linalg.norm(d) / max(c.width, c.height) for d, c in zip(off, cameras, strict=True)]))
 
 
 def _largest_overlap(model: Reconstruction, others: Sequence[Reconstruction]) -> Reconstruction:
