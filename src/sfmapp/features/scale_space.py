@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.simd.f32x16 import (
+    SUMS_WIDTH,
     WIDTH,
-    fma,
     larger,
     load,
     smaller,
@@ -22,6 +22,7 @@ from sfmapp.simd.f32x16 import (
     store,
     subtract,
     summing_along,
+    summing_down,
     where_above,
     where_at_least,
 )
@@ -45,6 +46,7 @@ SLACK = 3 * WIDTH
 ROWS_AT_ONCE = 4
 _SHORT, _LONG = 6, 10
 _sum_along_short, _sum_along_long = summing_along(_SHORT), summing_along(_LONG)
+_sum_down = summing_down(ROWS_AT_ONCE)
 # moves of a keypoint while it is refined
 _NUM_ROUNDS = 5
 
@@ -63,43 +65,10 @@ def empty_lines(width: int) -> Floats:
 
 
 @numba.njit(cache=True, nogil=True)
-def _sum_down(
-    source: Pointer, weights: Pointer, steps: Pointer, at: int, target: Pointer, to: int, pitch: int, num: int
-) -> None:
-    """Fill 32 pixels in each of four rows, ``pitch`` apart, with the weighted sums of those above and below.
-
-    Args:
-        weights: (num,) those of the last row; those of the one before begin one further on, and so on.
-        steps: (num,) places in source of the rows' first pixels, from the uppermost on.
-        at: column. to: place in target.
-    """
-    a0 = a1 = b0 = b1 = c0 = c1 = d0 = d1 = splat(np.float32(0.0))
-    for j in range(num):
-        place = steps[j] + at
-        x, y = load(source, place), load(source, place + WIDTH)
-        w = splat(weights[j + 3])
-        a0, a1 = fma(w, x, a0), fma(w, y, a1)
-        w = splat(weights[j + 2])
-        b0, b1 = fma(w, x, b0), fma(w, y, b1)
-        w = splat(weights[j + 1])
-        c0, c1 = fma(w, x, c0), fma(w, y, c1)
-        w = splat(weights[j])
-        d0, d1 = fma(w, x, d0), fma(w, y, d1)
-    store(target, to, a0)
-    store(target, to + WIDTH, a1)
-    store(target, to + pitch, b0)
-    store(target, to + pitch + WIDTH, b1)
-    store(target, to + 2 * pitch, c0)
-    store(target, to + 2 * pitch + WIDTH, c1)
-    store(target, to + 3 * pitch, d0)
-    store(target, to + 3 * pitch + WIDTH, d1)
-
-
-@numba.njit(cache=True, nogil=True)
 def _sum_down_narrow(
     source: Pointer, weights: Pointer, steps: Pointer, width: int, target: Pointer, to: int, pitch: int, num: int
 ) -> None:
-    """:func:`_sum_down` where a row has no 32 pixels."""
+    """As ``_sum_down`` where a row has no 32 pixels."""
     for r in range(ROWS_AT_ONCE):
         for c in range(width):
             value = np.float32(0.0)
@@ -160,13 +129,13 @@ def blur(
             r = min(start - n + j, last - 1 + n)
             places[j] = (min(abs(r), 2 * h - 2 - r) - top) * w
         down = offset(weights, reach - n)
-        if w < 2 * WIDTH:
+        if w < 2 * WIDTH:  # on every machine, as these sums are rounded otherwise
             _sum_down_narrow(pixels, down, steps, w, line, WIDTH, pitch, num)
         else:
-            for c in range(0, w, 2 * WIDTH):
+            for c in range(0, w, SUMS_WIDTH):
                 # the last ones once more, in place of pixels that are not there
-                c = min(c, w - 2 * WIDTH)
-                _sum_down(pixels, down, steps, c, line, WIDTH + c, pitch, num)
+                c = min(c, w - SUMS_WIDTH)
+                _sum_down(pixels, down, steps, c, num, line, WIDTH + c, pitch)
         for r in range(start, min(start + ROWS_AT_ONCE, last)):
             row = (r - start) * pitch + WIDTH
             for i in range(1, n + 1):

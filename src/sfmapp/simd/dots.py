@@ -18,10 +18,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from sfmapp.simd.llvm import BYTE, I16, I32, constant, data, int64, load, splat, store
+from sfmapp.simd.llvm import BYTE, I16, I32, constant, data, int64, load, processor_features, splat, store
 from sfmapp.simd.llvm import intrinsic as intrinsic_of
 
 DIMS = 128  # numbers of a row
@@ -32,16 +31,10 @@ _PAIRS = ir.VectorType(I16, 2 * LANES)
 _SUM_BYTES, _VECTOR_BYTES = 4, 4 * LANES
 
 
-def _features() -> list[str]:
-    """Of the processor that numba compiles for."""
-    features: list[str] = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
-    return features
-
-
 # 512 bits at a time, or 256; 0: the processor has no products of bytes
-_BYTES_WIDTH = 512 if "+avx512vnni" in _features() else 256 if "+avxvnni" in _features() else 0
+_BYTES_WIDTH = 512 if "+avx512vnni" in processor_features() else 256 if "+avxvnni" in processor_features() else 0
 # rows of the first matrix, and groups of LANES of the second, in a tile: as many vectors of sums as stay in registers
-ROWS, GROUPS = 8 if "+avx512f" in _features() else 2, 2
+ROWS, GROUPS = 8 if "+avx512f" in processor_features() else 2, 2
 # the form of both matrices in which the tile is the fastest here, and what the second is stored less
 ROW_TYPE: Any
 GROUP_TYPE: Any

@@ -13,6 +13,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 from sfmapp.simd import llvm
@@ -21,6 +22,10 @@ WIDTH = 16
 
 FLOATS, INTS = ir.VectorType(llvm.F32, WIDTH), ir.VectorType(llvm.I32, WIDTH)
 _BYTES = ir.VectorType(llvm.BYTE, WIDTH)
+# a vector is one register, and instructions take any lanes of two
+_IS_ONE_REGISTER = "+avx512f" in llvm.processor_features()
+# vectors side by side that four rows of sums can have in registers
+SUMS_WIDTH = WIDTH * (2 if _IS_ONE_REGISTER else 1)
 
 
 class Row(types.Type):  # type: ignore[misc]
@@ -107,19 +112,26 @@ def summing_along(reach: int) -> Any:
     """An intrinsic (base, index, weights) -> row: the sums of ``weights[n] * base[index + n - reach + lane]`` over all
     n up to 2 reach; base and weights are pointers to float32, and reach is at most 16.
 
-    Loads that begin between lines of the cache cost twice as much as others, so neighbours come out of three.
+    Loads that begin between lines of the cache cost twice as much as others, so where instructions take any lanes of
+    two vectors neighbours come out of three.
     """
 
     @intrinsic
     def sum_along(typingctx: Any, base: Any, index: Any, weights: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             base, index, weights = args
-            places = [builder.add(index, llvm.int64(step)) for step in (-WIDTH, 0, WIDTH)]
-            before, here, after = (llvm.load(builder, builder.gep(base, [place]), FLOATS, 4) for place in places)
+
+            def at(step: int) -> Any:
+                return llvm.load(builder, builder.gep(base, [builder.add(index, llvm.int64(step))]), FLOATS, 4)
+
+            before, here, after = (at(step) for step in (-WIDTH, 0, WIDTH)) if _IS_ONE_REGISTER else (None,) * 3
             value = llvm.constant(FLOATS, 0.0)
             for n in range(-reach, reach + 1):
-                pair, first = ((before, here), WIDTH + n) if n < 0 else ((here, after), n)
-                moved = builder.shuffle_vector(*pair, ir.Constant(INTS, list(range(first, first + WIDTH))))
+                if _IS_ONE_REGISTER:
+                    pair, first = ((before, here), WIDTH + n) if n < 0 else ((here, after), n)
+                    moved = builder.shuffle_vector(*pair, ir.Constant(INTS, list(range(first, first + WIDTH))))
+                else:
+                    moved = at(n)
                 weight = builder.load(builder.gep(weights, [llvm.int64(n + reach)]))
                 value = llvm.fma(builder, llvm.splat(builder, weight, FLOATS), moved, value)
             return value
@@ -127,6 +139,43 @@ def summing_along(reach: int) -> Any:
         return row(base, types.intp, weights), codegen
 
     return sum_along
+
+
+def summing_down(num_rows: int) -> Any:
+    """An intrinsic (base, weights, steps, at, num, target, to, pitch) that fills SUMS_WIDTH floats in each of so many
+    rows of target, ``pitch`` apart from ``to`` on: row r has the sums of ``weights[j + num_rows - 1 - r] *
+    base[steps[j] + at + lane]`` over j up to num, so that each row read adds to all of them; ``steps`` is a pointer to
+    int64, the others are to float32.
+    """
+
+    @intrinsic
+    def sum_down(
+        typingctx: Any, base: Any, weights: Any, steps: Any, at: Any, num: Any, target: Any, to: Any, pitch: Any
+    ) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            base, weights, steps, at, num, target, to, pitch = args
+            columns = [llvm.int64(c) for c in range(0, SUMS_WIDTH, WIDTH)]
+            sums = [[cgutils.alloca_once(builder, FLOATS) for _ in columns] for _ in range(num_rows)]
+            for slot in (slot for slots in sums for slot in slots):
+                builder.store(llvm.constant(FLOATS, 0.0), slot)
+            with cgutils.for_range(builder, num) as loop:
+                place = builder.add(builder.load(builder.gep(steps, [loop.index])), at)
+                pixels = [llvm.load(builder, builder.gep(base, [builder.add(place, c)]), FLOATS, 4) for c in columns]
+                for r, slots in enumerate(sums):
+                    number = builder.add(loop.index, llvm.int64(num_rows - 1 - r))
+                    weight = llvm.splat(builder, builder.load(builder.gep(weights, [number])), FLOATS)
+                    for pixel, slot in zip(pixels, slots, strict=True):
+                        builder.store(llvm.fma(builder, weight, pixel, builder.load(slot)), slot)
+            for r, slots in enumerate(sums):
+                line = builder.add(to, builder.mul(pitch, llvm.int64(r)))
+                for c, slot in zip(columns, slots, strict=True):
+                    llvm.store(builder, builder.load(slot), builder.gep(target, [builder.add(line, c)]), 4)
+            return context.get_dummy_value()
+
+        places = types.intp, types.intp
+        return types.void(base, weights, steps, *places, target, *places), codegen
+
+    return sum_down
 
 
 def _binary(operation: str) -> Callable[..., Any]:

@@ -11,10 +11,17 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 
 BYTE, I16, I32, I64 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64)
 F32, F64 = ir.FloatType(), ir.DoubleType()
 _SUFFIXES = {F32: "f32", F64: "f64", BYTE: "i8", I32: "i32"}
+
+
+def processor_features() -> list[str]:
+    """LLVM's names, with a sign before, of the processor that numba compiles for."""
+    features: list[str] = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    return features
 
 
 def int64(value: int) -> Any:
