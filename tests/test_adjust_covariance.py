@@ -158,6 +158,33 @@ def test_undetermined_is_said():
     assert not estimate_covariances(found, sigma_px=1.0, varying=Varying(points=every)).is_determined
 
 
+def test_an_image_that_is_left_open_says_nothing_of_the_others_and_takes_nothing_from_them():
+    """Two points do not tell a pose: the others are as sure as without that image."""
+    scene = make_scene(7, 6, 120, sigma_px=0.5)
+    found = scene.observed.copy()
+    own = np.flatnonzero((found.tracks.obs_image_idx == 2) & found.obs_is_inlier)
+    found.obs_is_inlier[own[2:]] = False
+    adjust_bundle(found, OPTIONS)
+    without = found.copy()
+    without.obs_is_inlier[own] = False
+    without.cam_from_world[2] = np.nan
+    beside, alone = (estimate_covariances(model, OPTIONS, sigma_px=0.5) for model in (found, without))
+    assert beside.is_determined
+    assert (~beside.is_told).nonzero()[0].tolist() == [2]
+    assert np.isinf(beside.of_image(2)).all()
+    assert beside.image_idx[beside.is_told].tolist() == alone.image_idx.tolist()
+    np.testing.assert_allclose(beside.poses[beside.is_told], alone.poses, rtol=1e-5, atol=1e-14)
+    np.testing.assert_allclose(beside.intrinsics[0], alone.intrinsics[0], rtol=1e-5)
+    seen_there = np.isin(beside.track_idx, found.tracks.obs_track_idx[own[:2]])
+    assert np.isinf(beside.points[seen_there]).all()
+    rest = beside.track_idx[~seen_there]
+    expected = alone.points[np.searchsorted(alone.track_idx, rest)]
+    np.testing.assert_allclose(beside.points[~seen_there], expected, rtol=1e-5, atol=1e-14)
+    # and compared with the truth in the gauge of those that are told
+    poses, _, _ = errors_in_gauge(found, scene.ground_truth, beside)
+    assert np.mean(normalized(poses[beside.is_told], beside.poses[beside.is_told])) < 3.0
+
+
 @pytest.mark.parametrize("sigma", [1.0, 20.0])
 def test_places_that_are_loosely_known_hold_a_precise_model_as_loosely(sigma: float) -> None:
     """As a phone's positions hold a model of ten thousands of keypoints: far from nothing, and as a similarity says."""

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sfmapp.geometry import triangulation
+from sfmapp.camera.camera import project
+from sfmapp.geometry import rigid3, triangulation
 from sfmapp.geometry.triangulation import Observed
 from sfmapp.scene.reconstruction import Reconstruction
 from sfmapp.scene.synthetic import make_scene
@@ -60,6 +61,31 @@ def test_small_angles_and_single_observations_are_refused():
     assert not model.is_triangulated.any()
     model.cam_from_world[1:] = np.nan
     assert run(triangulation.triangulate_tracks, model) == 0
+
+
+@pytest.mark.parametrize(("share", "is_kept"), [(1e-8, False), (5e-4, False), (2e-3, True)])
+def test_no_point_is_a_thousand_times_nearer_to_one_camera(share: float, is_kept: bool):
+    """A wrong match whose one ray passes the other camera has a point in its centre, which agrees with any pixel."""
+    model = make_scene(5, 2, 60, layout="forward").ground_truth
+    tracks = model.tracks
+    track = int(np.flatnonzero(np.diff(tracks.track_ptr) == 2)[0])
+    far, near = range(tracks.track_ptr[track], tracks.track_ptr[track + 1])
+    if rigid3.apply(model.cam_from_world[tracks.obs_image_idx[far]], model.centers[tracks.obs_image_idx[near]])[2] < 0:
+        far, near = near, far  # the one in front, which the other sees
+    image, other = tracks.obs_image_idx[near], tracks.obs_image_idx[far]
+    away = share * np.linalg.norm(model.centers[other] - model.centers[image])
+    ray = rigid3.rotation_matrix(model.cam_from_world[image]).T @ [0.3, 0.0, 1.0]
+    model.point_xyz[track] = model.centers[image] + away * ray / np.linalg.norm(ray)
+    for o in (near, far):
+        rotation = rigid3.rotation_matrix(model.cam_from_world[tracks.obs_image_idx[o]])
+        seen = rotation @ (model.point_xyz[track] - model.centers[tracks.obs_image_idx[o]])
+        camera = model.cameras[model.image_camera_idx[tracks.obs_image_idx[o]]]
+        tracks.obs_xy[o] = project(camera, seen[None])[0]
+    for kernel in (triangulation.classify_observations, triangulation.triangulate_tracks):
+        tried = model.copy()
+        run(kernel, tried, max_error_px=1e-3)
+        assert tried.is_triangulated[track] == is_kept
+        assert tried.obs_is_inlier[[near, far]].tolist() == [is_kept, is_kept]
 
 
 def test_classification_drops_and_restores():

@@ -32,6 +32,7 @@ from sfmapp.adjust.kernels import (
     linearize,
     weigh_observations,
 )
+from sfmapp.adjust.open_images import eliminated, open_pose_blocks
 from sfmapp.adjust.options import AdjustOptions
 from sfmapp.adjust.problem import EVERYTHING, Problem, Varying
 from sfmapp.adjust.solver import Engine, make_engine
@@ -62,14 +63,16 @@ class Covariances:
 
     Attributes:
         image_idx: (n,) images, of a rig's frame all that are registered; poses: (n, 6, 6) over rotation w (radians)
-            and translation v of ``x_cam <- exp(w) x_cam + v``; those of a rig's pose at its sensor 0.
+            and translation v of ``x_cam <- exp(w) x_cam + v``; those of a rig's pose at its sensor 0. Infinite for
+            images that the observations leave open, in which the gauge has no part.
         camera_idx: (m,) cameras; free_params: m arrays (Q,), positions in ``Camera.params``; intrinsics: m arrays
             (Q, Q) over these.
-        track_idx: (p,) points; points: (p, 3, 3) in the world; infinite for a point without depth.
+        track_idx: (p,) points; points: (p, 3, 3) in the world; infinite for a point without depth, or in an image that
+            is left open.
         sigma_px: the noise of one coordinate of an observation, estimated or as given.
         num_gauge: degrees of freedom that only the inner constraints hold: 7 in a free network, 6 with a baseline, 1
             (the scale) with one constant image and no baseline.
-        is_determined: False if more than that is undetermined; all covariances are infinite then.
+        is_determined: False if more than that, and single images, is undetermined; all covariances are infinite then.
     """
 
     image_idx: NDArray[np.int64]
@@ -82,6 +85,11 @@ class Covariances:
     sigma_px: float
     num_gauge: int
     is_determined: bool
+
+    @property
+    def is_told(self) -> Mask:
+        """(n,) bool: images whose poses are not left open."""
+        return np.asarray(np.isfinite(self.poses).all(axis=(1, 2)), np.bool_)
 
     def of_point(self, track_idx: int) -> Array:
         """(3, 3) of a point, in the world. Raises InputError if it had no part, for want of a place or of inliers."""
@@ -133,11 +141,32 @@ def estimate_covariances(
     information = reduced_matrix(engine)[np.ix_(used, used)]
     scale = engine.diagonal[used]
     basis, constraint = gauge_of(problem, used, information, scale, has_factors=extras is not None)
-    covariance = constrained_inverse(information, scale, basis, constraint)
-    determined = covariance is not None
+    covariance, told = constrained_inverse(information, scale, basis, constraint), used
+    if covariance is None:
+        covariance, told, basis = _beside_open_images(problem, used, information, scale, extras is not None)
     full = np.zeros((len(used), len(used)))
-    full[np.ix_(used, used)] = covariance if covariance is not None else np.inf
-    return _collect(engine, reconstruction, full * variance, variance, len(basis), determined)
+    full[used], full[:, used] = np.inf, np.inf
+    full[~used], full[:, ~used] = 0.0, 0.0
+    if covariance is not None:
+        full[np.ix_(told, told)] = covariance * variance
+    return _collect(engine, reconstruction, full, variance, len(basis), covariance is not None)
+
+
+def _beside_open_images(
+    problem: Problem, used: Mask, information: Array, scale: Array, has_factors: bool
+) -> tuple[Array | None, Mask, Array]:
+    """As :func:`constrained_inverse` without images that are open by themselves; the unknowns (B * 8,) bool that are
+    left, and their open directions (k, M). None where others are open."""
+    told = used.copy()
+    for block in open_pose_blocks(problem, information, scale, used):
+        told[block * 8 : block * 8 + 8] = False
+    gone = ~told[used]
+    # two images or fewer say nothing of their size
+    if not gone.any() or told[problem.pose_block[problem.pose_block >= 0] * 8].sum() < 3:
+        return None, used, np.zeros((0, len(scale)))
+    information, scale = eliminated(information, scale, gone), scale[~gone]
+    basis, constraint = gauge_of(problem, told, information, scale, has_factors=has_factors)
+    return constrained_inverse(information, scale, basis, constraint), told, basis
 
 
 def residual_variance(engine: Engine) -> float:
@@ -240,6 +269,7 @@ def similarities_of(problem: Problem, used: Mask, scale: Array) -> tuple[Array, 
     """What similarities of the world, of which a baseline tells the size, do to the unknowns that are used (k, N), and
     their constraints (k, N), in lengths that a diagonal scale (N,) gives; none where no pose varies."""
     poses = np.flatnonzero(problem.pose_block >= 0)
+    poses = poses[used[problem.pose_block[poses] * 8]]
     if len(poses) == 0:
         return np.zeros((0, len(scale))), np.zeros((0, len(scale)))
     place = (problem.pose_block[poses][:, None] * 8 + np.arange(6)).ravel()
@@ -248,7 +278,7 @@ def similarities_of(problem: Problem, used: Mask, scale: Array) -> tuple[Array, 
     # on a long way a short baseline says so little of the scale that it would pass for nothing
     freedoms = 6 if problem.has_baseline else 7
     basis, constraint = wide[:freedoms, used], constraint[:freedoms, used]
-    _add_point_motion(problem, used, basis)
+    _add_point_motion(problem, problem.poses[poses], used, basis)
     norm = np.sqrt((basis**2 * scale).sum(1))
     norm[norm == 0] = 1.0
     return basis / norm[:, None], constraint / norm[:, None]
@@ -262,12 +292,12 @@ def open_directions(basis: Array, constraint: Array, told: Array, *, has_factors
     return open_ @ basis, open_ @ constraint
 
 
-def _add_point_motion(problem: Problem, used: Mask, basis: Array) -> None:
-    """Add to a basis (k, N) of similarities, in place, what they do to points that are blocks."""
+def _add_point_motion(problem: Problem, poses: Array, used: Mask, basis: Array) -> None:
+    """Add to a basis (k, N) of similarities of poses (n, 7), in place, what they do to points that are blocks."""
     kept = np.flatnonzero(problem.point_block >= 0)
     if not len(kept):
         return
-    centers = rigid3.center(problem.poses[problem.pose_block >= 0])
+    centers = rigid3.center(poses)
     mean = centers.mean(0)
     size = max(float(np.sqrt(((centers - mean) ** 2).sum(1).mean())), 1e-12)
     away = problem.xyz[kept] - mean
@@ -337,6 +367,7 @@ def _collect(
             p.points, p.images(engine.rows), p.lenses, p.block_dim, engine.loss, engine.factor, covariance, variance,
             points,
         )  # fmt: skip
+        points[~np.isfinite(points).all(axis=(1, 2))] = np.inf
     for n in np.flatnonzero(p.point_block >= 0):
         at = p.point_block[n] * 8 + np.arange(3)
         points[n] = covariance[np.ix_(at, at)]
@@ -422,7 +453,7 @@ def errors_in_gauge(
         poses (n, 6), intrinsics m times (Q,), and points (p, 3).
     """
     images = covariances.image_idx
-    wanted = moved_to_gauge(estimate, ground_truth, images, covariances.num_gauge)
+    wanted = moved_to_gauge(estimate, ground_truth, images[covariances.is_told], covariances.num_gauge)
     intrinsics = [
         (estimate.cameras[c].params - ground_truth.cameras[c].params)[free]
         for c, free in zip(covariances.camera_idx, covariances.free_params, strict=True)

@@ -25,6 +25,10 @@ Bools = NDArray[np.bool_]
 
 # A track of 10 observations has 45 pairs; longer ones are sampled with about as many.
 MAX_HYPOTHESES = 45
+# The same thing is told in two photographs where it is larger in one of them by less than a scale space has octaves
+# for, of which ten are 1000. A wrong match whose one ray passes another camera has its point in that camera's centre,
+# where it agrees with any pixel.
+_NEAREST_SHARE = 1e-3
 
 
 class Views(NamedTuple):
@@ -140,6 +144,27 @@ def _min_cosine(xyz: Array, centers: Array, used: Bools, k: int, enough: float) 
             if best <= enough:
                 return best
     return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _drop_nearest(xyz: Array, centers: Array, used: Bools, k: int) -> int:
+    """Let go of the used centres that are closer to the point than the farthest by a share that no match bridges;
+    returns how many are left."""
+    farthest = 0.0
+    for i in range(k):
+        if used[i]:
+            farthest = max(farthest, _squared_distance(xyz, centers[i]))
+    left = 0
+    for i in range(k):
+        used[i] = used[i] and _squared_distance(xyz, centers[i]) >= _NEAREST_SHARE**2 * farthest
+        left += used[i]
+    return left
+
+
+@numba.njit(cache=True, nogil=True)
+def _squared_distance(a: Array, b: Array) -> float:
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return float(x * x + y * y + z * z)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -270,10 +295,11 @@ def triangulate_tracks(
                     copy_into(best_used, used)
         if best_count < 2 or (k > 2 and not _refine(best_xyz, centers, rays, best_used, k)):
             continue
-        inliers, _ = _mark_inliers(
+        _mark_inliers(
             best_xyz, obs, k, obs_image_idx, obs_xy, rotation, translation, image_camera_idx, canonical,
             limit, best_used,
         )  # fmt: skip
+        inliers = _drop_nearest(best_xyz, centers, best_used, k)
         if inliers < 2 or _min_cosine(best_xyz, centers, best_used, k, max_cosine) > max_cosine:
             continue
         copy_into(point_xyz[t], best_xyz)
@@ -290,8 +316,9 @@ def classify_observations(
 ) -> int:  # fmt: skip
     """Decide afresh which observations support the given triangulated tracks; returns how many points were dropped.
 
-    Arguments as in :func:`triangulate_tracks`. An observation is an inlier if its image is registered and its
-    reprojection error small enough; a point with fewer than two inliers or too small an angle becomes NaN.
+    Arguments as in :func:`triangulate_tracks`. An observation is an inlier if its image is registered, its
+    reprojection error small enough and its camera not next to the point where others are a thousand times as far; a
+    point with fewer than two inliers or too small an angle becomes NaN.
     """
     track_ptr, obs_image_idx, obs_xy = observed
     rotation, translation, image_camera_idx, canonical = views
@@ -305,7 +332,6 @@ def classify_observations(
         if math.isnan(point_xyz[t, 0]):
             continue
         k: Any = np.int64(0)
-        inliers = 0
         for o in range(track_ptr[t], track_ptr[t + 1]):
             i = obs_image_idx[o]
             cam = image_camera_idx[i]
@@ -315,11 +341,12 @@ def classify_observations(
                     point_xyz[t], rotation[i], translation[i], canonical[cam], obs_xy[o, 0], obs_xy[o, 1]
                 )
             used[k] = error <= limit
-            obs_is_inlier[o] = used[k]
             if used[k]:
-                inliers += 1
                 _center(rotation[i], translation[i], centers[k])
             k += 1
+        inliers = _drop_nearest(point_xyz[t], centers, used, k)
+        for m in range(k):
+            obs_is_inlier[track_ptr[t] + m] = used[m]
         if inliers >= 2 and _min_cosine(point_xyz[t], centers, used, k, max_cosine) <= max_cosine:
             continue
         dropped += 1

@@ -19,7 +19,6 @@ from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera
 from sfmapp.camera.models import PARAM_NAMES
 from sfmapp.events import Events
-from sfmapp.geometry import rigid3
 from sfmapp.mapping import structure
 from sfmapp.mapping.initialize import InitialPair, initial_angles, initialize_from_pair, rank_initial_pairs
 from sfmapp.mapping.keypoint_noise import KeypointNoise, keypoint_noise
@@ -426,7 +425,9 @@ class Mapper:
         found = selected_covariances(self.reconstruction, options, **given)
         if found is None and self.reconstruction.is_registered.sum() <= MAX_DENSE_IMAGES:
             found = estimate_covariances(self.reconstruction, options, **given)
-        return (found.image_idx, found.poses) if found is not None and found.is_determined else None
+        if found is None or not found.is_told.all():
+            return None
+        return found.image_idx, found.poses
 
     def _polishing(self) -> tuple[AdjustOptions, NDArray[np.bool_]]:
         """Options of the last adjustment, and the cameras (C,) bool whose principal points are free in it."""
@@ -495,8 +496,9 @@ class Mapper:
         """Standard deviations of the finished model for the report: of parameters, and of centres against its size.
 
         They follow from the residuals under the model (independent errors, a right lens model) in the gauge of inner
-        constraints: what the photographs can tell, not how far the lens model is off. Empty where that is not
-        determined, and for large models in which most photographs meet most others.
+        constraints: what the photographs can tell, not how far the lens model is off. Images whose poses are left open
+        are named, and have no part in the gauge. Empty where more is not determined, and for large models in which
+        most photographs meet most others.
         """
         reconstruction, options = self.reconstruction, self.adjust_options
         chosen = self._free_principal_points()
@@ -507,11 +509,11 @@ class Mapper:
         found = estimate(reconstruction, options, prior_cameras=self.prior_cameras)
         if found is None or not found.is_determined:
             return Uncertainty()
-        rotation = rigid3.rotation_matrix(reconstruction.cam_from_world[found.image_idx])
+        images, poses = found.image_idx[found.is_told], found.poses[found.is_told]
         # c = -R^T t moves by -R^T v; its variance along one axis is a third of the trace
-        center_sigma = np.sqrt(np.trace(found.poses[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
-        angle_sigma = np.degrees(np.sqrt(np.trace(found.poses[:, :3, :3], axis1=1, axis2=2) / 3.0))
-        centers = -np.einsum("nji,nj->ni", rotation, reconstruction.cam_from_world[found.image_idx, 4:])
+        center_sigma = np.sqrt(np.trace(poses[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
+        angle_sigma = np.degrees(np.sqrt(np.trace(poses[:, :3, :3], axis1=1, axis2=2) / 3.0))
+        centers = reconstruction.centers[images]
         size = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
         parameters = [
             CameraSigmas(
@@ -533,8 +535,9 @@ class Mapper:
                 reconstruction.image_names[i]: ImageSigmas(
                     center_sigma_share=float(c) / size, rotation_sigma_deg=float(a)
                 )
-                for i, c, a in zip(found.image_idx, center_sigma, angle_sigma, strict=True)
+                for i, c, a in zip(images, center_sigma, angle_sigma, strict=True)
             },
+            images_left_open=[reconstruction.image_names[i] for i in found.image_idx[~found.is_told]],
         )
 
     def closing_options(self) -> tuple[AdjustOptions, Varying, KeypointNoise]:

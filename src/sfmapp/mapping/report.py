@@ -186,6 +186,7 @@ class Uncertainty(Report):
             shares of the largest distance of a centre from their middle.
         median_rotation_sigma_deg: of the rotations about each axis.
         images: by name.
+        images_left_open: those whose observations do not tell their poses, which are not among ``images``.
         closing_move_sigmas: how far the closing adjustments moved the cameras, rms, in the standard deviations that the
             residuals alone give; where it is above 2.5, all of these have grown by what is more.
     """
@@ -196,6 +197,7 @@ class Uncertainty(Report):
     worst_center_sigma_share: float | None = None
     median_rotation_sigma_deg: float | None = None
     images: Mapping[str, ImageSigmas] | None = None
+    images_left_open: Sequence[str] = ()
     closing_move_sigmas: float | None = None
 
 

@@ -200,6 +200,16 @@ def check_control(control: ControlReport | None) -> list[Check]:
     return [Check(name="ground control", value=value, light=light, thresholds=thresholds)]
 
 
+def check_open_images(models: Sequence[Uncertainty]) -> list[Check]:
+    """An amber light that names images whose own observations leave their poses open, of all models; none without."""
+    names = [name for found in models for name in found.images_left_open]
+    if not names:
+        return []
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    thresholds = "green: every pose is determined; the standard deviations of the other images do not hang on these"
+    return [Check(name="poses left open", value=shown, light="amber", thresholds=thresholds)]
+
+
 def check_poses(poses: PosesReport | None) -> list[Check]:
     """A light over known poses: amber where one is refuted, red where the largest model does not lie in their frame."""
     if poses is None or not poses.models:

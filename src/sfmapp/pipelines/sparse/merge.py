@@ -309,7 +309,8 @@ def _new_names(first: _Side, second: _Side) -> dict[str, str]:
 
 def _renamed(known: Uncertainty, new_name: dict[str, str]) -> Uncertainty:
     images = {new_name.get(name, name): sigma for name, sigma in (known.images or {}).items()}
-    return replace(known, images=images or None)
+    left_open = [new_name.get(name, name) for name in known.images_left_open]
+    return replace(known, images=images or None, images_left_open=left_open)
 
 
 def _records(

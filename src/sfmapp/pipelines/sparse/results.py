@@ -21,6 +21,7 @@ from sfmapp.report.document import (
     FORMAT,
     camera_rows,
     check_control,
+    check_open_images,
     check_poses,
     funnel_of_images,
     funnel_without_matches,
@@ -142,6 +143,7 @@ def _make_report(
         models=entries,
         checks=[
             *make_checks(entries, images, cameras, also),
+            *check_open_images([row.uncertainty for row in mapped]),
             *check_control(run.stages.control),
             *check_poses(poses),
         ]
