@@ -18,14 +18,22 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sfmapp.adjust.blas import (
+    divide_columns,
+    divide_rows,
+    factor_lower,
+    invert_lower,
+    subtract_product,
+    subtract_square,
+)
 from sfmapp.adjust.envelope import NO_PIVOT, EnvelopeOrder, EnvelopeSystem, gather_panel
-from sfmapp.adjust.fronts import FrontOrder, substitute
+from sfmapp.adjust.fronts import FrontOrder
 from sfmapp.adjust.linear import may_suit_fronts, prefers_fronts
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Subtrees cost at most this share of all each, and rows of large products are taken so many at a time.
+# Subtrees cost at most this share of all each, and rows and columns of large fronts are taken so many at a time.
 _SUBTREE, _ROWS = 1 / 24, 192
 
 
@@ -51,8 +59,7 @@ class FrontSystem:
                 self._children[parent].append(f)
         self._subtrees, self._above = _parted(order.parent, flops_of_fronts(order, block_dim))
         self._left: list[Array | None] = [None] * len(order.blocks)
-        self._inverse = [np.zeros((0, 0))] * len(order.blocks)
-        self._below = [np.zeros((0, 0))] * len(order.blocks)
+        self._factor = [np.zeros((0, 0))] * len(order.blocks)
 
     def _places_of_tiles(self, a: Ints, b: Ints, numbers: Ints) -> list[Ints]:
         """Where the tiles (a, b) of each front go in its own columns, as of :func:`gather_panel`."""
@@ -86,8 +93,6 @@ class FrontSystem:
     def _eliminate(self, f: int, tiles: Array, run: Callable[..., Any]) -> bool:
         """Factor the own columns of a front, and keep what it leaves to the one above; False where there is no
         factor."""
-        from scipy.linalg.lapack import dtrtri
-
         k, size = self._num_own[f], len(self._unknowns[f])
         own, rest = np.zeros((size, k)), np.zeros((size - k, size - k))
         gather_panel(tiles, self._places[f], own)
@@ -97,37 +102,38 @@ class FrontSystem:
             assert left is not None
             _add_left(left, self._at_parent[child], own, rest)
             self._left[child] = None
-        try:
-            factor = np.linalg.cholesky(own[:k])
-        except np.linalg.LinAlgError:
+        if not _factor_columns(own, run):
             return False
-        if not (factor.diagonal() ** 2 > NO_PIVOT * diagonal).all():
+        if not (own.diagonal() ** 2 > NO_PIVOT * diagonal).all():
             return False
-        inverse = np.ascontiguousarray(dtrtri(factor, lower=1)[0])
-        below = np.empty((size - k, k))
-
-        def substituted(i: int) -> None:
-            below[i : i + _ROWS] = own[k + i : k + i + _ROWS] @ inverse.T
+        below = own[k:]
 
         def subtracted(i: int) -> None:
             j = min(i + _ROWS, size - k)
-            rest[i:j, :j] -= below[i:j] @ below[:j].T  # the lower half is all that is used
+            subtract_product(rest[i:j, :i], below[i:j], below[:i])
+            subtract_square(rest[i:j, i:j], below[i:j])  # the lower half is all that is used
 
-        rows = range(0, size - k, _ROWS)
-        list(run(substituted, rows))
-        list(run(subtracted, rows))
-        self._inverse[f], self._below[f], self._left[f] = inverse, below, rest
+        list(run(subtracted, range(0, size - k, _ROWS)))
+        self._factor[f], self._left[f] = own, rest
         return True
 
     def substitute(self, rhs: Array) -> Array:
         """Solution (B * 8, ...) for a right-hand side (B * 8, ...), with the factor."""
         used = (np.arange(8) < self._dim[:, None]).ravel()
         at = (self._at[:, None] + np.arange(8)).ravel()[used]
-        x = np.empty((len(at), *rhs.shape[1:]))
-        x[at] = rhs[used]
-        substitute(self._unknowns, self._num_own, self._inverse, self._below, x)
+        x = np.empty((len(at), rhs.size // len(rhs)))
+        x[at] = rhs[used].reshape(len(at), -1)
+        fronts = list(zip(self._unknowns, self._num_own, self._factor, strict=True))
+        for unknowns, k, factor in fronts:
+            own = x[unknowns[0] : unknowns[0] + k]
+            divide_columns(own, factor[:k], is_turned=False)
+            x[unknowns[k:]] -= factor[k:] @ own
+        for unknowns, k, factor in reversed(fronts):
+            own = x[unknowns[0] : unknowns[0] + k]
+            own -= factor[k:].T @ x[unknowns[k:]]
+            divide_columns(own, factor[:k], is_turned=True)
         step = np.zeros(rhs.shape)
-        step[used] = x[at]
+        step[used] = x[at].reshape(len(at), *rhs.shape[1:])
         return step
 
     def inverse_tiles(self, first: Ints, second: Ints) -> Array:
@@ -151,13 +157,16 @@ class FrontSystem:
         num_waiting = [len(children) for children in self._children]
         made: dict[int, Array] = {}
         for f in range(len(self._num_own) - 1, -1, -1):
-            k, parent, inverse = self._num_own[f], int(self._order.parent[f]), self._inverse[f]
+            k, parent, factor = self._num_own[f], int(self._order.parent[f]), self._factor[f]
             full = np.empty((len(self._unknowns[f]), len(self._unknowns[f])))
-            full[:k, :k] = inverse.T @ inverse
+            full[:k, :k] = factor[:k]
+            invert_lower(full[:k, :k])
+            _mirror(full, k)
             if parent >= 0:
                 at = self._at_parent[f]
                 full[k:, k:] = made[parent][np.ix_(at, at)]
-                through = self._below[f] @ inverse
+                through = factor[k:].copy()
+                divide_rows(through, factor[:k], is_turned=False)
                 full[k:, :k] = -full[k:, k:] @ through
                 full[:k, k:] = full[k:, :k].T
                 full[:k, :k] -= through.T @ full[k:, :k]
@@ -167,6 +176,34 @@ class FrontSystem:
             if num_waiting[f]:
                 made[f] = full
             yield f, full
+
+
+def _factor_columns(own: Array, run: Callable[..., Any]) -> bool:
+    """Put the columns (M, K) of a Cholesky factor in the place of those of a matrix, its lower half, some at a time;
+    False where it is not positive definite."""
+    size, num = own.shape
+    for c in range(0, num, _ROWS):
+        d = min(c + _ROWS, num)
+
+        def divided(i: int, c: int = c, d: int = d) -> None:
+            divide_rows(own[i : i + _ROWS, c:d], own[c:d, c:d], is_turned=True)
+
+        def subtracted(i: int, c: int = c, d: int = d) -> None:
+            j = min(i + _ROWS, size)
+            subtract_product(own[i:j, d : min(j, num)], own[i:j, c:d], own[d : min(j, num), c:d])
+
+        if not factor_lower(own[c:d, c:d]):
+            return False
+        list(run(divided, range(d, size, _ROWS)))
+        if d < num:
+            list(run(subtracted, range(d, size, _ROWS)))
+    return True
+
+
+def _mirror(matrix: Array, num: int) -> None:
+    """Put the lower half of the first rows and columns of a matrix into the upper one."""
+    lower = np.tril(matrix[:num, :num])
+    matrix[:num, :num] = lower + np.tril(lower, -1).T
 
 
 def best_order(block_dim: Ints, a: Ints, b: Ints, fill: float) -> tuple[EnvelopeOrder | FrontOrder, float]:
@@ -219,10 +256,10 @@ def _parted(parent: Ints, flops: Array) -> tuple[list[range], list[int]]:
 def _add_left(left: Array, at: Ints, own: Array, rest: Array) -> None:
     """Add the lower half of what a front has left to the one above it, in whose unknowns it is at (N,), ascending."""
     k = own.shape[1]
+    num_own = int(np.searchsorted(at, k))
     for i in range(left.shape[0]):
         row = at[i]
-        for j in range(i + 1):
-            if at[j] < k:
-                own[row, at[j]] += left[i, j]
-            else:
-                rest[row - k, at[j] - k] += left[i, j]
+        for j in range(min(i + 1, num_own)):
+            own[row, at[j]] += left[i, j]
+        for j in range(num_own, i + 1):
+            rest[row - k, at[j] - k] += left[i, j]
