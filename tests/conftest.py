@@ -3,16 +3,39 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from sfmapp.kernel_compiling import compile_sparingly
+
 # the first example of a kernel may have to compile it; the same examples every time
 settings.register_profile("sfmapp", deadline=None, derandomize=True)
 settings.load_profile("sfmapp")
 
+compile_sparingly()
+
 CHECKOUT = Path(__file__).resolve().parent.parent
+COMPILE_ALL = """
+from sfmapp.events import Events
+from sfmapp.kernel_cache import load_numba_sparingly
+from sfmapp.workspace import kernels
+load_numba_sparingly()
+modules = (*kernels.MODULES, *kernels.ODOMETRY_MODULES, *kernels.DENSE_MODULES, *kernels.INERTIAL_MODULES)
+with kernels.kernels_compiling(Events(), {}, tuple(dict.fromkeys(modules))):
+    pass
+"""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have the kernels compiled once before xdist's workers begin with all tests, which would each compile the same at
+    the same time."""
+    is_all = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if is_all and config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        subprocess.run([sys.executable, "-c", COMPILE_ALL], check=False)  # what fails, fails in a test
 
 
 @pytest.fixture(scope="session")

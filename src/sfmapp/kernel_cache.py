@@ -18,6 +18,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from sfmapp.kernel_compiling import compile_sparingly
+
 VARIABLE = "NUMBA_CACHE_DIR"
 NAME = "sfmapp-kernels"
 ADVICE = f"set {VARIABLE} to a folder that you, and nobody else, can write to; one in OUT will do"
@@ -72,14 +74,16 @@ def load_numba_sparingly() -> None:
     that call BLAS: together as much time and memory as numba itself. What is compiled already needs none of it. Here
     numba does so before it first compiles, and always without BLAS, which no kernel of ours calls. Of each kernel it
     also reads the code from which others could inline it, and lists what that defines, half of the time of loading;
-    here only of those that others are compiled with. The process has to be a command's own; a program that imports
-    sfmapp keeps its numba whole.
+    here only of those that others are compiled with. What is missing is compiled with less, too, see
+    :mod:`sfmapp.kernel_compiling`. The process has to be a command's own; a program that imports sfmapp keeps its numba
+    whole.
     """
     from numba.core import environment
     from numba.core.caching import FunctionCache
     from numba.core.codegen import JITCodeLibrary
     from numba.core.cpu import CPUContext
 
+    compile_sparingly()
     with _PATCHING:
         if "load_overload" not in vars(FunctionCache):
             FunctionCache.load_overload = _load_compiled

@@ -6,6 +6,7 @@ import numpy as np
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
+__version__: str
 types: Any
 
 def float32(value: float | np.integer[Any]) -> float: ...

@@ -13,12 +13,13 @@ from importlib import import_module
 
 from numba.core import event as numba_event
 
-from sfmapp.kernel_cache import take_turns
+from sfmapp.kernel_cache import load_numba_sparingly, take_turns
 
 
 def main() -> None:
     """Answer until there are no more questions."""
     take_turns(strict=True)
+    load_numba_sparingly()
     gc.disable()  # what compiling leaves behind is soon given back as a whole
     took = 0.0
     for line in sys.stdin:
