@@ -62,6 +62,8 @@ FLOORS = (
 INNER_FLOORS = {
     "odometry": (
         ("run",),
+        ("early_calibration",),
+        ("live_shutter",),
         ("frames_adjustment", "known_map_check", "missed_frames", "recognition", "shutter"),
         ("records",),
         ("tracker", "initialize", "stereo_clock"),

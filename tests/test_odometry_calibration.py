@@ -16,12 +16,13 @@ from sfmapp.adjust.solver import adjust_bundle
 from sfmapp.camera.camera import Camera, CameraModel, project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
+from sfmapp.odometry.early_calibration import EarlyCalibration
+from sfmapp.odometry.live_shutter import LiveShutter
 from sfmapp.odometry.map.keyframe_map import Keyframe, KeyframeMap
 from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.refinement import calibration_check
 from sfmapp.odometry.refinement.calibration_check import Unknowns, _changed
-from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.scene.rig import Rig
 
@@ -244,7 +245,7 @@ def test_what_a_map_gains_while_its_calibration_is_questioned_is_brought_along()
     local = LocalMap(given, OPTIONS, None, 0)
     local.keyframes = keyframes
     with ThreadPoolExecutor(1) as executor:
-        calibration = EarlyCalibration(True, executor)
+        calibration = EarlyCalibration(True, LiveShutter(False, []), executor)
         assert not calibration.refines(local, 18)
         assert calibration.is_asking
         for number, keyframe in enumerate(later, 19):
@@ -267,7 +268,7 @@ def test_a_question_is_forgotten_with_the_map_that_it_was_asked_of() -> None:
     local = LocalMap(given, OPTIONS, None, 0)
     local.keyframes, _ = drive(rig_of(lens()), given, bend=0.04, num=18)
     adjust_finally(local.keyframes, replace(OPTIONS, refine_camera=False), Events())
-    calibration = EarlyCalibration(True, None)
+    calibration = EarlyCalibration(True, LiveShutter(False, []), None)
     calibration.refines(local, 18)
     calibration.forget()
     assert not calibration.refines(local, 40)

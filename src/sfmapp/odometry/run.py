@@ -16,6 +16,7 @@ from sfmapp.camera.camera import project
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
 from sfmapp.images.sequence import Frame, Sequence
+from sfmapp.odometry.early_calibration import EarlyCalibration
 from sfmapp.odometry.frames_adjustment import adjust_frames
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks
 from sfmapp.odometry.frontend.pyramid import Pyramid, build_pyramid
@@ -25,6 +26,7 @@ from sfmapp.odometry.inertial.smoothing import smooth_trajectory
 from sfmapp.odometry.initialize import MapInitializer, TwoViews
 from sfmapp.odometry.keyframe_images import KeyframeImages
 from sfmapp.odometry.known_map_check import KnownMapCheck
+from sfmapp.odometry.live_shutter import LiveShutter
 from sfmapp.odometry.loops.relocalize import position_of
 from sfmapp.odometry.loops.sweep import is_too_large
 from sfmapp.odometry.map.atlas import Atlas
@@ -36,12 +38,11 @@ from sfmapp.odometry.motion_model import MotionModel
 from sfmapp.odometry.options import OdometryOptions
 from sfmapp.odometry.recognition import Recognition
 from sfmapp.odometry.records import FrameRecord, gather, leave_keyframe, measure_again
-from sfmapp.odometry.refinement.early_calibration import EarlyCalibration
 from sfmapp.odometry.refinement.final_adjustment import FinalAdjustment, adjust_finally
 from sfmapp.odometry.report import OdometryReport, ShutterReport
 from sfmapp.odometry.residual_memory import NOT_KNOWN, Correlation, ResidualMemory
 from sfmapp.odometry.result import FrameState, OdometryResult
-from sfmapp.odometry.shutter import straighten
+from sfmapp.odometry.shutter import straighten, undo
 from sfmapp.odometry.snapshot import FrameSnapshot, MapSnapshot
 from sfmapp.odometry.state import Phase, RunState
 from sfmapp.odometry.stereo_clock import StereoClock
@@ -130,10 +131,12 @@ class Odometry:
         self.given_rig = sequence.rig
         # windows; and, seldom, a vocabulary and the calibration, neither of which may keep a window waiting
         self.executor = ThreadPoolExecutor(3, "adjust") if threads > 1 else None
-        self.calibration = EarlyCalibration(options.refine_camera, self.executor)
         self.state, self.counts = RunState(), _Counts()
         self.records: list[FrameRecord] = []
         self.imu = sequence.imu if with_imu else None
+        alone = self.imu is None and not self.rig.is_stereo
+        self.shutter = LiveShutter(options.refine_camera and alone, self.records)
+        self.calibration = EarlyCalibration(options.refine_camera, self.shutter, self.executor)
         # a rig holds rotations well enough
         self.atlas = Atlas(options, self.executor, None if self.rig.is_stereo else self.imu)
         self.local: LocalMap | None = None  # the map that the camera is in, or was in when it was lost
@@ -295,7 +298,8 @@ class Odometry:
         if self._repeat(record, view):
             return True
         step = self.motion.predict([r.timestamp_s for r in self.records[-3:]])
-        found = track(local, tracked.tracks, tracked.pose, step, tracked.previous, view.pyramids[0])
+        readout = self.shutter.rows().readout
+        found = track(local, tracked.tracks, tracked.pose, step, tracked.previous, view.pyramids[0], readout)
         if found is None:
             return False
         self.motion.learn(rigid3.compose(found.pose, rigid3.inverse(tracked.pose)))
@@ -316,8 +320,11 @@ class Odometry:
         if not self.options.filter:
             return NOT_KNOWN
         seen = self.tracked.tracks.subset(self.tracked.is_mapped)
-        expected = project(local.camera, rigid3.apply(self.tracked.pose, local.keyframes.point_xyz[seen.point_id]))
-        return self.residuals.look(seen.point_id, seen.xy - expected)
+        xyz = local.keyframes.point_xyz[seen.point_id]
+        expected = project(local.camera, rigid3.apply(self.tracked.pose, xyz))
+        rows = self.shutter.rows(self.motion.step)
+        straight = seen.xy - rows.shift_px(local.camera, self.tracked.pose, xyz, seen.xy)
+        return self.residuals.look(seen.point_id, straight - expected)
 
     def _repeat(self, record: FrameRecord, view: View) -> bool:
         """Give a frame that shows what the last one shows the pose of that one, if it is so."""
@@ -344,7 +351,9 @@ class Odometry:
             seen = self.clock.look(tracked.previous, view, self.records[-2].timestamp_s)
         self._take_over(local, None)
         self._cull(local)
-        tracked.tracks = local.add_keyframe(seen, tracked.pose, tracked.tracks, len(self.records))
+        self.shutter.straighten(local.keyframes, local.map_idx, max(local.newest + 1 - self.options.window, 0))
+        rows = self.shutter.rows(self.motion.step)
+        tracked.tracks = local.add_keyframe(seen, tracked.pose, tracked.tracks, len(self.records), rows)
         self._count_mapped()
         self._settle(record, state, tracked.pose, is_keyframe=True)
         self._remember(view)
@@ -359,7 +368,8 @@ class Odometry:
         local = self.local
         assert local is not None
         before = local.pose(local.newest)
-        if not self.calibration.refines(local, len(self.records)):
+        reason = self.calibration.refines(local, len(self.records))
+        if not reason:
             return
         self.rig, pose = local.rig, local.pose(local.newest)
         record.give_out(pose)
@@ -368,7 +378,7 @@ class Odometry:
         self.tracked.stay_in_map(pose, zoom)
         self.tracked.tracks = local.tracks_of_newest()
         self._count_mapped()
-        self._tell("the images contradict the given calibration: going on with a refined one", everything=True)
+        self._tell(reason, everything=True)
 
     def _cull(self, local: LocalMap) -> None:
         """Drop a keyframe that adds nothing, once it has left the window."""
@@ -622,8 +632,10 @@ class Odometry:
         """Undo a rolling shutter where the images clearly show one; the numbers behind that, None where it was not
         looked for."""
         if self.rig.is_stereo or not self.options.refine_camera or is_too_large(local.keyframes):
+            if self.shutter.found.readout:
+                undo(self.records, local.keyframes, local.map_idx, self.shutter.found.readout)
             return None
-        numbers = straighten(self.records, local.keyframes, local.map_idx, self.imu)
+        numbers = straighten(self.records, local.keyframes, local.map_idx, self.imu, self.shutter.found)
         self.events.raise_if_cancelled()
         if numbers.readout:
             self.events.decided("adjustment", "the images show a rolling shutter, which is undone", **numbers)

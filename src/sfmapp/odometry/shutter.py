@@ -10,11 +10,13 @@ shutter, or a camera that hardly moves, leaves it at zero.
 
 A map that was made as if there were none has given up observations for what the shutter did to them, most of all where
 it did much. Those left speak for a readout that is too short, so which agree is asked again after each step towards it.
+So does one whose readout was found early (:mod:`sfmapp.odometry.live_shutter`), and it has given up fewer.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +28,14 @@ from sfmapp.camera.camera import project
 from sfmapp.geometry import rigid3
 from sfmapp.images.sequence import Imu
 from sfmapp.mapping.structure import residual_scale_px
+from sfmapp.odometry.frontend.row_motion import by_rows
 from sfmapp.odometry.inertial.window import swings_at
 from sfmapp.odometry.map.backend import Job, classify, make_job, take_over
 from sfmapp.odometry.map.keyframe_map import KeyframeMap
-from sfmapp.odometry.records import FrameRecord, measure_again
+from sfmapp.odometry.records import FrameRecord
 from sfmapp.odometry.refinement.final_adjustment import MIN_EVIDENCE, MIN_SIGMA_PX
 from sfmapp.odometry.report import ShutterReport
+from sfmapp.odometry.tracker import measure_pose
 from sfmapp.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -40,7 +44,8 @@ Array = NDArray[np.float64]
 # has settled: the motion is known the better the straighter its images are. It has where the next change, were it as
 # much smaller as the last one was, would move nothing by 0.05 pixels that moves by 20 from frame to frame. No camera
 # reads longer than one frame; one that reads from the bottom up is mounted upside down.
-_STRIDES, _SETTLED, _MAX_READOUT = (0.25, 0.1, 0.1, 0.1, 0.1), 0.005, 1.0
+FIRST_STRIDE, NEXT_STRIDE, _ROUNDS = 0.25, 0.1, 5
+_SETTLED, _MAX_READOUT = 0.005, 1.0
 # A sensor that reads within so small a share is as good as a global shutter: what is found is some other error.
 _MIN_READOUT = 0.05
 # What a gyroscope has to explain beyond the frames: as much as errors of patches, which are not independent, make of
@@ -55,8 +60,26 @@ _SHORT = 0.01
 _STEPS, _GLANCE_STEPS = 12, 3
 
 
+class Found(NamedTuple):
+    """A readout, the evidence for it, and the map adjusted with it, None where there is nothing to be believed."""
+
+    readout: float
+    evidence: float
+    job: Job | None
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The readout of a rolling shutter that was found while a map grew, and the evidence for it, as those of
+    :class:`~sfmapp.odometry.report.ShutterReport`."""
+
+    readout: float = 0.0
+    evidence: float = 0.0
+    first_readout: float = 0.0
+
+
 def straighten(
-    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, imu: Imu | None = None
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, imu: Imu | None = None, begun: Begun | None = None
 ) -> ShutterReport:
     """Find the readout of the camera of a map, and move what its frames saw to where a global shutter had seen it.
 
@@ -65,44 +88,56 @@ def straighten(
 
     Args:
         imu: measured beside the frames; None where there is none, or where it is not to count.
+        begun: what was found before, and was taken off the keyframes as their ``row_shift``.
 
     Returns:
         The numbers behind the decision.
     """
-    total, last, first = 0.0, 0.0, (0.0, 0.0)
+    begun = begun or Begun()
+    total, last, first = begun.readout, begun.readout, (begun.evidence, begun.first_readout)
     source: Imu | None = None
-    for n, stride in enumerate(_STRIDES):
-        is_first = n == 0
-        found = _search(_RowShift(records, keyframes, map_idx, source), keyframes, stride, last)
+    for n in range(_ROUNDS):
+        is_first = n == 0 and total == 0
+        stride = FIRST_STRIDE if is_first else NEXT_STRIDE
+        shift_of = RowShift(records, keyframes, map_idx, source)
+        lay_shift(keyframes, shift_of, total)
+        found = search(*make_question(keyframes, shift_of), stride, last)
         if is_first and imu is not None:
-            turned = _search(_RowShift(records, keyframes, map_idx, imu), keyframes, stride, last)
+            shift_of = RowShift(records, keyframes, map_idx, imu)
+            turned = search(*make_question(keyframes, shift_of), stride, last)
             if turned[1] > found[1] + _CLEAR:
                 found, source = turned, imu
         readout, evidence, job = found
         if is_first:
             first = evidence, readout
-        # what is next gained is little, but never a loss
-        least = MIN_EVIDENCE if is_first else 0.0
-        if job is None or not evidence >= least or not _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT:
+        if job is None or not is_worth_it(readout, evidence, total):
             break
         total += readout
-        _move(records, keyframes, map_idx, _RowShift(records, keyframes, map_idx, source), readout)
+        lay_shift(keyframes, RowShift(records, keyframes, map_idx, source), total)
         classify(job.model, job.num_elsewhere)
         take_over(job, keyframes)
-        if last and readout**2 < _SETTLED * abs(last):
+        if has_settled(readout, last):
             break
-        measure_again(records, keyframes, map_idx)
+        _measure_again(records, keyframes, map_idx, total, source, beside_keyframes=True)
         last = readout
+    if total:
+        undo(records, keyframes, map_idx, total, source)
     return ShutterReport(evidence=first[0], min_evidence=MIN_EVIDENCE, first_readout=first[1], readout=total)
 
 
-def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float, last: float) -> tuple[float, float, Job | None]:
-    """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
-    where there is no least cost within reach, or costs that are no numbers; or, the first time, no sign of one.
+def is_worth_it(readout: float, evidence: float, total: float) -> bool:
+    """Whether a readout is believed on top of what was found before: first by much evidence; what is next gained is
+    little, but never a loss."""
+    return evidence >= (0.0 if total else MIN_EVIDENCE) and _MIN_READOUT <= abs(total + readout) <= _MAX_READOUT
 
-    Args:
-        last: what was found the time before, in whose direction the least cost is looked for first; 0 the first time.
-    """
+
+def has_settled(readout: float, last: float) -> bool:
+    """Whether what would be found after this on top of a readout is nothing, by how much it was the time before."""
+    return bool(last) and readout**2 < _SETTLED * abs(last)
+
+
+def make_question(keyframes: KeyframeMap, shift_of: RowShift) -> tuple[Job, Array]:
+    """A copy of a map that is asked for its readout, and (O, 2) how far that moves its observations."""
     everything = np.arange(len(keyframes.keyframes))
     job = make_job(keyframes, everything, everything > 0)
     model, tracks = job.model, job.model.tracks
@@ -110,14 +145,24 @@ def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float, last: fl
     for k, keyframe in enumerate(keyframes.keyframes):
         obs = tracks.observations_of_image(k)
         shifts[obs] = shift_of(keyframe.frame_idx, model.point_xyz[tracks.obs_track_idx[obs]], tracks.obs_xy[obs])
+    return job, shifts
+
+
+def search(job: Job, shifts: Array, stride: float, last: float) -> Found:
+    """The readout of least cost in steps of a stride, what it gains, and the map adjusted with it; None for the map
+    where there is no least cost within reach, or costs that are no numbers; or, the first time, no sign of one.
+
+    Args:
+        last: what was found the time before, in whose direction the least cost is looked for first; 0 the first time.
+    """
     if not shifts.any():
-        return 0.0, 0.0, None
-    sigma = residual_scale_px(model, MIN_SIGMA_PX)
+        return Found(0.0, 0.0, None)
+    sigma = residual_scale_px(job.model, MIN_SIGMA_PX)
     towards = 1 if last > 0 else -1
     if last == 0:
         glance = [_adjusted(job, shifts, n * stride, sigma, _GLANCE_STEPS)[0] for n in (-1, 0, 1)]
         if not np.isfinite(glance).all() or abs(_vertex(*glance)) * stride < 0.5 * _MIN_READOUT:
-            return 0.0, 0.0, None
+            return Found(0.0, 0.0, None)
         towards = 1 if glance[2] < glance[0] else -1
     costs = {n: _adjusted(job, shifts, n * stride, sigma)[0] for n in (0, towards)}
     if not costs[towards] < costs[0]:
@@ -130,10 +175,10 @@ def _search(shift_of: _RowShift, keyframes: KeyframeMap, stride: float, last: fl
             break
         best = beyond
     if {best - 1, best + 1} - set(costs) or not np.isfinite(list(costs.values())).all():
-        return 0.0, 0.0, None
+        return Found(0.0, 0.0, None)
     readout = stride * (best + _vertex(costs[best - 1], costs[best], costs[best + 1]))
     cost, job.model = _adjusted(job, shifts, readout, sigma)
-    return readout, costs[0] - cost, job
+    return Found(readout, costs[0] - cost, job)
 
 
 def _vertex(before: float, here: float, after: float) -> float:
@@ -144,13 +189,25 @@ def _vertex(before: float, here: float, after: float) -> float:
     return 0.5 * (before - after) / bend
 
 
-def _move(
-    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, shift_of: _RowShift, readout: float
+def lay_shift(keyframes: KeyframeMap, shift_of: RowShift, readout: float, first: int = 0) -> None:
+    """Note what a readout has done to the keyframes from one position on."""
+    for keyframe in keyframes.keyframes[first:]:
+        shift = None
+        if readout:
+            xyz = keyframes.point_xyz[keyframe.point_id]
+            shift = readout * shift_of(keyframe.frame_idx, xyz, keyframe.xy[:, 0])
+        keyframe.row_shift = shift
+
+
+def undo(
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, readout: float, imu: Imu | None = None
 ) -> None:
-    """Take what a readout adds from all observations."""
+    """Take what a readout adds from all observations of a map, in place."""
+    _measure_again(records, keyframes, map_idx, readout, imu)
+    shift_of = RowShift(records, keyframes, map_idx, imu)
+    lay_shift(keyframes, shift_of, readout)
     for keyframe in keyframes.keyframes:
-        xy = keyframe.xy[:, 0]
-        keyframe.xy[:, 0] = xy - readout * shift_of(keyframe.frame_idx, keyframes.point_xyz[keyframe.point_id], xy)
+        keyframe.xy[:, 0], keyframe.row_shift = keyframe.straight_xy(0), None
     for record in records:
         if record.map_idx == map_idx and len(record.xy):
             xy = record.xy.astype(np.float64)
@@ -158,7 +215,31 @@ def _move(
             record.see(record.point_id, xy - readout * shift)
 
 
-class _RowShift:
+def _measure_again(
+    records: list[FrameRecord], keyframes: KeyframeMap, map_idx: int, readout: float, imu: Imu | None,
+    beside_keyframes: bool = False,
+) -> None:  # fmt: skip
+    """Poses of the frames between the keyframes of a map, from what they saw less what a readout adds.
+
+    Args:
+        beside_keyframes: of those alone that a keyframe comes just before or after, by whose poses it moves.
+    """
+    mine = [r for r in records if r.map_idx == map_idx and r.has_pose]
+    shift_of, camera = RowShift(records, keyframes, map_idx, imu), keyframes.rig.cameras[0]
+    for before, record, after in zip([None, *mine], mine, [*mine[1:], None], strict=False):
+        is_beside = any(r is not None and r.is_keyframe for r in (before, after))
+        if record.is_keyframe or not len(record.xy) or (beside_keyframes and not is_beside):
+            continue
+        xyz, xy = keyframes.point_xyz[record.point_id], record.xy.astype(np.float64)
+        known = np.isfinite(xyz[:, 0])
+        keyframe = keyframes.keyframes[record.keyframe].rig_from_world
+        straight = (xy - readout * shift_of(record.frame_idx, xyz, xy))[known]
+        measured = measure_pose(camera, rigid3.compose(record.frame_from_keyframe, keyframe), xyz[known], straight)
+        if measured is not None:
+            record.measure(measured[1], rigid3.compose(measured[0], rigid3.inverse(keyframe)))
+
+
+class RowShift:
     """How far points move in the image between the middle of a readout of a whole frame and their rows."""
 
     def __init__(
@@ -189,8 +270,7 @@ class _RowShift:
         else:
             first, last, gap = *self._turned(n, before, after, gap), 2 * _SHORT
         here, there = (project(self._camera, rigid3.apply(pose, xyz)) for pose in (first, last))
-        shift = (there - here) / gap * (xy[:, 1] / self._camera.height - 0.5)[:, None]
-        return np.where(np.isfinite(shift), shift, 0.0)
+        return by_rows(self._camera, (there - here) / gap, xy, 1.0)
 
     def _turned(self, n: int, before: int, after: int, gap: float) -> tuple[Array, Array]:
         """Poses (7,) a short time before and after a frame, which moves as those around it and turns faster by its

@@ -16,6 +16,7 @@ from sfmapp.geometry.resection import estimate_pose
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, follow
 from sfmapp.odometry.frontend.chaining import chain_pose
 from sfmapp.odometry.frontend.pyramid import Pyramid
+from sfmapp.odometry.frontend.row_motion import RowMotion
 from sfmapp.odometry.frontend.small_image import align_small_images
 from sfmapp.odometry.map.local_map import LocalMap
 from sfmapp.odometry.options import OdometryOptions
@@ -58,14 +59,16 @@ class Tracked:
 
 
 def track(
-    local: LocalMap, tracks: ActiveTracks, pose: Array, step: Array, previous: Pyramid, pyramid: Pyramid
-) -> Tracked | None:
+    local: LocalMap, tracks: ActiveTracks, pose: Array, step: Array, previous: Pyramid, pyramid: Pyramid,
+    readout: float = 0.0,
+) -> Tracked | None:  # fmt: skip
     """Measure the pose of a new frame.
 
     Args:
         tracks: as they were in the last frame.
         pose: (7,) cam_from_world of the last frame. step: (7,) predicted pose of the new frame from the last.
         previous, pyramid: the images of both.
+        readout: of the rows of the new frame, as a share of the time since the last one; 0: all at once.
 
     Returns:
         None if the pose cannot be measured.
@@ -80,7 +83,7 @@ def track(
         if found.sum() < _MIN_FOUND * len(tracks) and level == _NEAR_LEVEL:
             continue
         usable = found & mapped
-        measured = measure_pose(local.camera, start, xyz[usable], followed.xy[usable])
+        measured = _measure_by_rows(local.camera, pose, start, xyz[usable], followed.xy[usable], readout)
         if measured is not None:
             break
     else:
@@ -88,11 +91,13 @@ def track(
         measured = _chained(local.camera, followed.subset(found), references, xyz[found], mapped[found])
         if measured is None:
             return None
-    tracks, mapped = followed.subset(found), mapped[found]
+    tracks, mapped, xyz = followed.subset(found), mapped[found], xyz[found]
     new_pose, covariance, inlier, sigma = measured
     keep = np.ones(len(tracks), bool)
     keep[mapped] = inlier
-    keep[~mapped] = _near_epipolar_lines(local, tracks.subset(~mapped), new_pose)
+    rows, free = RowMotion(readout, rigid3.compose(new_pose, rigid3.inverse(pose))), tracks.subset(~mapped)
+    straight = free.moved(free.xy - rows.shift_px(local.camera, new_pose, xyz[~mapped], free.xy))
+    keep[~mapped] = _near_epipolar_lines(local, straight, new_pose)
     return Tracked(
         new_pose,
         covariance,
@@ -155,6 +160,27 @@ def measure_pose(camera: Camera, start: Array, xyz: Array, xy: Array) -> tuple[A
     if inlier.sum() < MIN_INLIERS:
         return None
     return best.cam_from_world, best.covariance, inlier, sigma
+
+
+def _measure_by_rows(
+    camera: Camera, before: Array, start: Array, xyz: Array, xy: Array, readout: float
+) -> tuple[Array, Array, Mask, float] | None:
+    """What :func:`measure_pose` returns, of points taken back to where they were in the middle of the readout.
+
+    The motion while rows are read is that since the frame before, first as it is foretold, then as it was measured.
+
+    Args:
+        before: (7,) cam_from_world of the frame before. readout: share of the time since then.
+    """
+    measured = measure_pose(camera, start, xyz, xy - _shift_since(camera, before, start, xyz, xy, readout))
+    if measured is None or not readout:
+        return measured
+    pose = measured[0]
+    return measure_pose(camera, pose, xyz, xy - _shift_since(camera, before, pose, xyz, xy, readout))
+
+
+def _shift_since(camera: Camera, before: Array, pose: Array, xyz: Array, xy: Array, readout: float) -> Array:
+    return RowMotion(readout, rigid3.compose(pose, rigid3.inverse(before))).shift_px(camera, pose, xyz, xy)
 
 
 def _near_epipolar_lines(local: LocalMap, tracks: ActiveTracks, pose: Array) -> Mask:

@@ -122,7 +122,7 @@ def _moved(keyframe: Keyframe, b_from_a: Array, id_offset: int) -> Keyframe:
     return Keyframe(
         keyframe.frame_idx, keyframe.timestamp_s, keyframe.name,
         similarity.transform_poses(b_from_a, keyframe.rig_from_world), keyframe.point_id + id_offset, keyframe.xy,
-        keyframe.is_inlier,
+        keyframe.is_inlier, keyframe.row_shift,
     )  # fmt: skip
 
 
@@ -150,6 +150,7 @@ def fuse_points(keyframes: KeyframeMap, renamed: Ids) -> None:
         order = order[first]
         keyframe.point_id, keyframe.xy = ids[order], keyframe.xy[order]
         keyframe.is_inlier = keyframe.is_inlier[order]
+        keyframe.row_shift = None if keyframe.row_shift is None else keyframe.row_shift[order]
         # the observations that made the pair have been checked against the other side
         keyframe.is_inlier[is_new[order]] = np.isfinite(keyframe.xy[is_new[order]][..., 0])
     keyframes.recount()

@@ -25,6 +25,8 @@ class Keyframe:
         point_id: (N,) int64 ascending, the points (tracks) seen; a point is in the map once it is triangulated.
         xy: (N, S, 2) float64 where each camera of the rig saw it, pixels; NaN where it did not.
         is_inlier: (N, S) bool: agrees with the map.
+        row_shift: (N, 2) pixels by which a rolling shutter has moved what the first camera saw; the map is adjusted to
+            what is left without that. None: nothing.
     """
 
     frame_idx: int
@@ -34,6 +36,12 @@ class Keyframe:
     point_id: NDArray[np.int64]
     xy: Array
     is_inlier: NDArray[np.bool_]
+    row_shift: Array | None = None
+
+    def straight_xy(self, sensor: int) -> Array:
+        """(N, 2) where a camera of the rig would have seen the points, had it read all its rows at once."""
+        xy: Array = self.xy[:, sensor]
+        return xy if self.row_shift is None or sensor else xy - self.row_shift
 
 
 @dataclass
@@ -130,7 +138,7 @@ class KeyframeMap:
                 images.append(np.full(int(seen.sum()), num_sensors * k + s, np.int32))
                 feature.append(np.flatnonzero(seen))
                 ids.append(keyframe.point_id[seen])
-                xy.append(keyframe.xy[seen, s])
+                xy.append(keyframe.straight_xy(s)[seen])
                 inlier.append(keyframe.is_inlier[seen, s])
         all_ids = np.concatenate(ids)
         point_id, track = np.unique(all_ids, return_inverse=True)

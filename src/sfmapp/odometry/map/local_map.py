@@ -16,6 +16,7 @@ from sfmapp.images.sequence import Imu
 from sfmapp.odometry.frontend.active_tracks import ActiveTracks, References, align_to_references, patch_warp
 from sfmapp.odometry.frontend.corners import find_corners
 from sfmapp.odometry.frontend.pyramid import Pyramid
+from sfmapp.odometry.frontend.row_motion import RowMotion
 from sfmapp.odometry.frontend.stereo import match_stereo
 from sfmapp.odometry.inertial.window import NUM_KEYFRAMES, turns_between
 from sfmapp.odometry.map.backend import Backend, Job, choose_window, make_job
@@ -168,25 +169,29 @@ class LocalMap:
         if not known:
             return ActiveTracks.none()
         recent, self.images = self.images, known
-        found = self._find_again(self._expected(ActiveTracks.none(), pyramid, pose), ActiveTracks.none(), pyramid)
+        expected = self._expected(ActiveTracks.none(), pyramid, pose, RowMotion())
+        found = self._find_again(expected, ActiveTracks.none(), pyramid)
         self.images = recent
         return found
 
-    def add_keyframe(self, view: View, pose: Array, tracks: ActiveTracks, frame_number: int) -> ActiveTracks:
+    def add_keyframe(
+        self, view: View, pose: Array, tracks: ActiveTracks, frame_number: int, rows: RowMotion | None = None
+    ) -> ActiveTracks:
         """Make a keyframe of a tracked view: find lost points again, add corners, triangulate, begin to adjust.
 
         Args:
             view: the frame. pose: (7,) its rig_from_world. tracks: what was tracked into it, outliers left out.
             frame_number: frames processed so far, the clock of the backend.
+            rows: how the camera moved while the frame was read; None: it did not.
 
         Returns:
             The tracks to follow from here.
         """
-        pyramid = view.pyramids[0]
+        pyramid, rows = view.pyramids[0], rows or RowMotion()
         known = self.known.near(self.keyframes, pose)
         self.images |= known
         if self.images:
-            sought = self._expected(tracks, pyramid, pose)
+            sought = self._expected(tracks, pyramid, pose, rows)
             found = self._find_again(sought, tracks, pyramid)
             self._count_visible(view.frame_idx, tracks.point_id, found.point_id, sought, pyramid)
             tracks = tracks.joined(found)
@@ -197,6 +202,8 @@ class LocalMap:
         tracks = self._renew_references(tracks, number, pose)
         tracks = tracks.joined(self._new_corners(tracks, pyramid, number))
         self._append(view, pose, tracks)
+        if rows.readout:
+            tracks = self._straighten_newest(tracks, rows)
         if len(view.pyramids) > 1:
             self._match_stereo(view, tracks)
         self.backend.finish(self.keyframes)
@@ -204,6 +211,15 @@ class LocalMap:
         for old in [k for k in self.images if k <= number - _KEPT_IMAGES]:
             del self.images[old]
         return tracks
+
+    def _straighten_newest(self, tracks: ActiveTracks, rows: RowMotion) -> ActiveTracks:
+        """Note what a rolling shutter has done to the newest keyframe, and where its new references lie without it."""
+        keyframe, number = self.keyframes.keyframes[-1], self.newest
+        shift = rows.shift_px(self.camera, keyframe.rig_from_world, self.points_of(tracks)[0], tracks.xy)
+        keyframe.row_shift, ray = shift, tracks.reference_ray.copy()
+        here = tracks.reference == number
+        ray[here] = pixels_to_normalized(self.camera, tracks.xy[here] - shift[here])
+        return replace(tracks, reference_ray=ray)
 
     def _append(self, view: View, pose: Array, tracks: ActiveTracks) -> None:
         xy = np.full((len(tracks), len(self.rig.cameras), 2), np.nan)
@@ -278,7 +294,7 @@ class LocalMap:
         found &= (np.linalg.norm(xy - sought.guess, axis=1) < _FOUND_PX) & (zncc > _FOUND_LIKENESS)
         return replace(sought.tracks, xy=xy, zncc=zncc).subset(found)
 
-    def _expected(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array) -> _Sought:
+    def _expected(self, tracks: ActiveTracks, pyramid: Pyramid, pose: Array, rows: RowMotion) -> _Sought:
         """The points of recent keyframes that are not tracked any more and should be in sight, and where."""
         lost = self._lost_points(tracks)
         xyz = self.keyframes.point_xyz[lost.point_id]
@@ -287,6 +303,7 @@ class LocalMap:
         in_camera = rigid3.apply(pose, xyz)
         in_reference = np.einsum("nij,nj->ni", references.rotation[k], xyz) + references.translation[k]
         guess, ratio = project(self.camera, in_camera), in_camera[:, 2] / in_reference[:, 2]
+        guess += rows.shift_px(self.camera, pose, xyz, guess)
         height, width = pyramid.shape
         margin = np.minimum(guess, np.array([width, height]) - guess).min(1)
         near = (margin > _MARGIN_PX) & (ratio < _FOUND_SCALE) & (ratio > 1 / _FOUND_SCALE)  # False for NaN
