@@ -23,6 +23,7 @@ from sfmapp.surface import child, gaps, poisson, trim
 from sfmapp.surface.mesh import make_mesh
 from sfmapp.surface.options import SurfaceOptions
 from sfmapp.surface.patch_cloud import make_patch_cloud
+from sfmapp.surface.trim import pieces
 
 SPACING = 0.1
 
@@ -278,6 +279,39 @@ def test_a_surface_that_stays_open_has_its_small_holes_closed() -> None:
     # nothing is left open: both are closed, however large they are beside the spacing
     _, closed = gaps.close_gaps(xyz, faces, kept, None, 0.25, 0.02)
     assert closed.all()
+
+
+def test_a_membrane_is_no_smaller_than_what_its_rim_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz, faces = tube(5.0)
+    kept = (xyz[faces][:, :, 2] < 3.0 + 1e-9).all(axis=1)
+    middle = xyz[faces].mean(axis=1)
+    kept &= (np.abs(middle[:, 2] - 1.5) > 0.5) | (np.abs(np.arctan2(middle[:, 1], middle[:, 0])) > 0.5)
+    piece = pieces(faces[~kept], len(xyz))
+    least = gaps._least_areas(xyz, faces[~kept], piece)
+    # the window is what it is, the balloon of 5 pi hangs on a circle, of 63 sides
+    flat = gaps._membranes(xyz, faces[~kept], np.isin(np.arange(len(xyz)), faces[kept]))
+    area = np.bincount(piece, np.linalg.norm(face_vectors(flat, faces[~kept]), axis=1))
+    assert 0.75 < least.min() < 1.1
+    assert least.max() == pytest.approx(np.pi, rel=0.01)
+    assert (least <= area * (1.0 + 1e-12)).all()
+    # what is too large by that alone needs no membrane, and what comes of it is the same
+    asked: list[int] = []
+    membranes = gaps._membranes
+
+    def counted(xyz: NDArray, faces: NDArray, is_fixed: NDArray) -> NDArray:
+        asked.append(len(faces))
+        return membranes(xyz, faces, is_fixed)
+
+    monkeypatch.setattr(gaps, "_membranes", counted)
+    for share, spacing, num in ((0.15, 0.1, 1), (0.15, 0.02, 0), (0.25, 0.02, 2)):
+        asked.clear()
+        moved, closed = gaps.close_gaps(xyz, faces, kept, None, share, spacing)
+        assert sum(asked) == sum(np.sort(np.bincount(piece))[:num])
+        with monkeypatch.context() as nothing:
+            nothing.setattr(gaps, "_least_areas", lambda *_: np.zeros(2))
+            other, expected = gaps.close_gaps(xyz, faces, kept, None, share, spacing)
+        np.testing.assert_array_equal(closed, expected)
+        np.testing.assert_allclose(moved, other, atol=1e-12)
 
 
 def test_a_dome_stays_a_dome() -> None:

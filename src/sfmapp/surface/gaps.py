@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfmapp.dense.scene import DenseScene
-from sfmapp.scene.mesh import face_areas
+from sfmapp.scene.mesh import face_areas, face_vectors
+from sfmapp.surface.patch_cloud import CHUNK
 from sfmapp.surface.trim import in_view, pieces
 
 # as large as a dome on a flat gap, a half sphere
@@ -55,9 +56,12 @@ def close_gaps(
     is_fixed = np.zeros(len(xyz), np.bool_)
     is_fixed[faces[kept]] = True
     area = np.bincount(piece, face_areas(xyz, faces[idx]))
-    # the membranes of the largest balloons would take long and come to nothing
     is_beside = np.bincount(piece, is_fixed[faces[idx]].any(axis=1)) > 0
-    candidate = is_beside & (area <= LARGEST_BALLOON * kept_area)
+    # the membranes of the largest balloons would take long and come to nothing
+    least, patched = _least_areas(xyz, faces[idx], piece), (LARGEST_PATCHED * spacing) ** 2
+    candidate = is_beside & (area <= LARGEST_BALLOON * kept_area) & (least <= largest_share * kept_area)
+    if (is_beside & ~candidate).any():
+        candidate &= least <= patched
     idx, piece = idx[candidate[piece]], piece[candidate[piece]]
     if not len(idx):
         return xyz, kept
@@ -71,12 +75,28 @@ def close_gaps(
         largest[(shown > 0.5 * flat_area) & is_balloon] *= SHOWN
     is_gap = candidate & (flat_area <= largest)
     if (is_beside & ~is_gap).any():
-        is_gap &= flat_area <= (LARGEST_PATCHED * spacing) ** 2
+        is_gap &= flat_area <= patched
     out, moved = kept.copy(), xyz.copy()
     out[idx] = is_gap[piece]
     flattened = np.unique(faces[idx[(is_gap & is_balloon)[piece]]])
     moved[flattened] = flat[flattened]
     return moved, out
+
+
+def _least_areas(
+    xyz: NDArray[np.float64], faces: NDArray[np.int32], piece: NDArray[np.int32]
+) -> NDArray[np.float64]:  # fmt: skip
+    """(P,) what the area of any surface with the rim of each piece of some faces (F, 3) is at least.
+
+    Triangles' normals, as long as their areas, add up to what the rim alone tells (Stokes).
+    """
+    total = np.zeros((int(piece.max()) + 1, 3))
+    for start in range(0, len(faces), CHUNK):
+        part = slice(start, start + CHUNK)
+        vectors = face_vectors(xyz, faces[part])
+        for axis in range(3):
+            total[:, axis] += np.bincount(piece[part], vectors[:, axis], len(total))
+    return np.asarray(np.linalg.norm(total, axis=1))
 
 
 def _membranes(xyz: NDArray[np.float64], faces: NDArray[np.int32], is_fixed: NDArray[np.bool_]) -> NDArray[np.float64]:
