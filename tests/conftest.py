@@ -11,6 +11,11 @@ import pytest
 from hypothesis import settings
 
 from sfmapp.kernel_compiling import compile_sparingly
+from sfmapp.packages import BLAS_THREADS
+
+# As commands do, before numpy is loaded, here and in processes that tests start. Workers of pytest have a core each;
+# on it threads of a BLAS that wait for one another spin, which costs up to a hundred times what they compute.
+os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
 
 # the first example of a kernel may have to compile it; the same examples every time
 settings.register_profile("sfmapp", deadline=None, derandomize=True)

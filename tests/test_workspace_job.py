@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from sfmapp.errors import InputError, InterruptedRunError, UsageError
 from sfmapp.events import Event, Events
@@ -59,13 +59,15 @@ def test_a_command_is_a_block(tmp_path: Path) -> None:
 
 def test_the_workspace_is_locked_and_sums_are_of_one_thread(tmp_path: Path) -> None:
     assert np.ones((2, 2)).sum() == 4  # the library of linear algebra is loaded
-    before = [library["num_threads"] for library in threadpool_info()]
-    with Job.opened("weigh", tmp_path, tmp_path / "out", None) as job:
-        assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {1}
-        with pytest.raises(UsageError, match="is running"), open_workspace(tmp_path / "out", "weigh"):
-            pass
-        assert job.threads == job.options.num_workers
-    assert [library["num_threads"] for library in threadpool_info()] == before
+    with threadpool_limits(2, "blas"):
+        before = [library["num_threads"] for library in threadpool_info()]
+        assert 2 in before
+        with Job.opened("weigh", tmp_path, tmp_path / "out", None) as job:
+            assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {1}
+            with pytest.raises(UsageError, match="is running"), open_workspace(tmp_path / "out", "weigh"):
+                pass
+            assert job.threads == job.options.num_workers
+        assert [library["num_threads"] for library in threadpool_info()] == before
     assert not (tmp_path / "out" / ".lock").exists()
 
 
