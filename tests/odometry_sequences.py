@@ -103,10 +103,14 @@ def room_rig(is_stereo: bool) -> Rig:
 
 
 @cache
+def whole_room_walk(num_frames: int, seed: int = 0) -> RenderedSequence:
+    """One world for all walks of a seed: what differs in frames or in cameras shares the images that are the same."""
+    return rendered.room(num_frames, seed, OPTICS, PINHOLE)
+
+
 def room_walk(num_frames: int = 80, is_stereo: bool = False, seed: int = 0) -> RenderedSequence:
     """The first frames of the walk round the room, 30 frames a second, without motion blur."""
-    sequence = rendered.room(80, seed, OPTICS, PINHOLE)
-    return replace(sequence._take(np.arange(num_frames)), rig=room_rig(is_stereo))
+    return replace(whole_room_walk(80, seed)._take(np.arange(num_frames)), rig=room_rig(is_stereo))
 
 
 @cache
@@ -128,6 +132,16 @@ class Told(list[Event]):
 
 def run(sequence: Played, options: OdometryOptions | None = None, seed: int = 0, threads: int = 2) -> OdometryResult:
     return run_odometry(sequence, options or OdometryOptions(), seed=seed, threads=threads)  # type: ignore[arg-type]
+
+
+@cache
+def _run_room(num_frames: int, is_stereo: bool, seed: int) -> OdometryResult:
+    return run(room(num_frames, is_stereo, seed))
+
+
+def run_room(num_frames: int = 80, is_stereo: bool = False, seed: int = 0) -> OdometryResult:
+    """Odometry of :func:`room` by default options, run once for all tests that only read it: not to be changed."""
+    return _run_room(num_frames, is_stereo, seed)
 
 
 def centers_and_ground_truth(result: OdometryResult, sequence: Played, map_idx: int = 0) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -71,24 +72,31 @@ def carve(*args: object) -> int:
     return main(["carve", *map(str, args), "--cells", "64", "--no-recording", "-q"])
 
 
-def test_patches_hollow_out_what_silhouettes_leave_full(photographs: Path, tmp_path: Path) -> None:
-    write_patches(tmp_path / "patches.npz", patches_inside(), [view.name for view in VIEWS])
-    assert carve(photographs, "-o", tmp_path / "out", "--with-dense", tmp_path / "patches.npz") == 0
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+@pytest.fixture(scope="module")
+def joined(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with patches.npz and the result of carving with them, out/; to be read only."""
+    folder = tmp_path_factory.mktemp("joined")
+    write_patches(folder / "patches.npz", patches_inside(), [view.name for view in VIEWS])
+    assert carve(photographs, "-o", folder / "out", "--with-dense", folder / "patches.npz") == 0
+    return folder
+
+
+def test_patches_hollow_out_what_silhouettes_leave_full(joined: Path) -> None:
+    report = json.loads((joined / "out" / "report.json").read_text())
     # ten outlines leave a good deal below the trough as well, and that stays as far as they ask for it
     assert report["joining"]["hull_volume"] > 2.0 * VOLUME
     assert 0.97 * VOLUME < report["surface"]["volume"] < 1.3 * VOLUME
     assert report["carving"]["volume_low"] < report["surface"]["volume"] < report["carving"]["volume_high"]
     assert "joined.npz" in report["files"]
-    inner, outer = read_octree(tmp_path / "out" / "joined.npz").volume_bounds()
+    inner, outer = read_octree(joined / "out" / "joined.npz").volume_bounds()
     assert inner < report["surface"]["volume"] < outer
 
 
-def test_the_surface_says_what_tells_it_and_a_second_call_joins_no_more(photographs: Path, tmp_path: Path) -> None:
-    write_patches(tmp_path / "patches.npz", patches_inside(), [view.name for view in VIEWS])
-    out = tmp_path / "out"
-    call = photographs, "-o", out, "--with-dense", tmp_path / "patches.npz"
-    assert carve(*call) == 0
+def test_the_surface_says_what_tells_it_and_a_second_call_joins_no_more(
+    photographs: Path, joined: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(joined / "out", tmp_path / "out"))
+    call = photographs, "-o", out, "--with-dense", joined / "patches.npz"
     limits = json.loads((out / "report.json").read_text())["limits"]
     first = (out / "mesh.ply").read_bytes()
     header, body = first.split(b"end_header\n", 1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from odometry_sequences import PINHOLE, Played, Told, absolute_error, keyframe_map, play, room, room_walk, run
+from odometry_sequences import PINHOLE, Played, Told, absolute_error, keyframe_map, play, room, room_walk, run, run_room
 from rendered_worlds.worlds import gallery_world
 from sfmapp.adjust.pose import refine_pose
 from sfmapp.camera.camera import Camera, CameraModel, pixels_to_normalized, project, simple_camera
@@ -32,9 +32,8 @@ Array = NDArray[np.float64]
 NUM_FRAMES = 80
 
 
-@cache
 def first_run() -> OdometryResult:
-    return run_odometry(room(NUM_FRAMES), OdometryOptions(), threads=2)  # type: ignore[arg-type]
+    return run_room(NUM_FRAMES)
 
 
 @cache

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odometry_sequences import Images, room
+from odometry_sequences import Images, room, run_room
 from sfmapp.adjust.covariance import pose_errors_in_gauge
 from sfmapp.events import Event, Events
 from sfmapp.geometry import rigid3, similarity
@@ -89,4 +89,4 @@ def test_sigmas_reckon_with_pictures_that_are_blurred_and_nothing_else_tells() -
 
 
 def test_a_walk_through_a_still_room_is_not_doubted() -> None:
-    assert run_odometry(room(80), OdometryOptions(covariance=False), events=Events()).maps[0].contradictions == []
+    assert run_room().maps[0].contradictions == []

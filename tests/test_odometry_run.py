@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import odometry_sequences as played
-from odometry_sequences import Played, Told, absolute_error, path_length, run
+from odometry_sequences import Played, Told, absolute_error, path_length, run, run_room
 from rendered_worlds import sequences as rendered
 from sfmapp.events import Events
 from sfmapp.geometry import rigid3, similarity
@@ -53,8 +53,7 @@ def assert_no_jump(result: OdometryResult, sequence: Played, bound_m: float) -> 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_camera_follows_a_walk(seed: int) -> None:
-    sequence = played.room(seed=seed)
-    result = run(sequence)
+    sequence, result = played.room(seed=seed), run_room(seed=seed)
     assert len(result.maps) == 1
     assert (result.frame_map == 0).all()  # the frames before the map began have poses as well
     assert np.isfinite(result.cam_from_world).all()
@@ -69,8 +68,7 @@ def test_one_camera_follows_a_walk(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_two_cameras_know_metres_from_the_first_frame_on(seed: int) -> None:
-    sequence = played.room(is_stereo=True, seed=seed)
-    result = run(sequence)
+    sequence, result = played.room(is_stereo=True, seed=seed), run_room(is_stereo=True, seed=seed)
     assert (result.frame_state == FrameState.TRACKED).all()
     error, scale = absolute_error(result, sequence)
     assert 1e-5 < error < 0.01 * path_length(sequence)
@@ -80,7 +78,7 @@ def test_two_cameras_know_metres_from_the_first_frame_on(seed: int) -> None:
 
 
 def test_keyframes_are_frames_of_the_trajectory() -> None:
-    result = run(played.room())
+    result = run_room()
     for m in result.maps:
         model = m.reconstruction
         np.testing.assert_allclose(
@@ -104,7 +102,7 @@ def test_covariances_have_the_size_of_the_errors(is_stereo: bool) -> None:
     values = []
     for seed in (0, 1):
         sequence = played.room(is_stereo=is_stereo, seed=seed)
-        found = run(sequence).maps[0]
+        found = run_room(is_stereo=is_stereo, seed=seed).maps[0]
         assert found.covariance is not None
         ours = found.reconstruction.cam_from_world[found.keyframe_image_idx]
         errors = played.gauge_errors(
@@ -119,9 +117,7 @@ def test_covariances_have_the_size_of_the_errors(is_stereo: bool) -> None:
 
 @pytest.mark.parametrize("is_stereo", [False, True], ids=["mono", "stereo"])
 def test_runs_give_the_same_bytes_for_any_number_of_threads_also_beside_a_busy_one(is_stereo: bool) -> None:
-    sequence = played.room(is_stereo=is_stereo)
-    expected = digest(run(sequence))
-    assert digest(run(sequence)) == expected
+    sequence, expected = played.room(is_stereo=is_stereo), digest(run_room(is_stereo=is_stereo))
     assert digest(run(sequence, threads=1)) == expected
     stop = threading.Event()
 
@@ -143,7 +139,7 @@ def test_runs_give_the_same_bytes_for_any_number_of_threads_also_beside_a_busy_o
 
 def test_live_poses_know_nothing_of_the_future() -> None:
     sequence = played.room()
-    whole, part = run(sequence), run(sequence.taken(np.arange(50)))
+    whole, part = run_room(), run(sequence.taken(np.arange(50)))
     np.testing.assert_array_equal(whole.live_cam_from_world[:50], part.live_cam_from_world)
     np.testing.assert_array_equal(whole.frame_state[:50], part.frame_state)
 
@@ -297,7 +293,7 @@ def test_a_cancelled_run_stops() -> None:
 @pytest.mark.parametrize("is_stereo", [False, True], ids=["mono", "stereo"])
 def test_a_loop_closes_where_the_sequence_returns(is_stereo: bool) -> None:
     """Once round the room, 840 frames at 30 a second, every second of them, and on over the same way."""
-    walk = rendered.room(900, 0, played.OPTICS, played.PINHOLE)
+    walk = played.whole_room_walk(900)
     sequence = played.play(replace(walk, rig=played.room_rig(is_stereo))._take(np.arange(0, 900, 2)))
     told = Told()
     result = run_odometry(sequence, OdometryOptions(), events=told.events)  # type: ignore[arg-type]

@@ -177,7 +177,7 @@ def test_a_dropped_keyframe_leaves_its_frames_where_they_are(is_keyframe: bool) 
 
 def test_points_have_the_grey_of_what_they_are_on_whoever_listens() -> None:
     sequence = played.room()
-    result = played.run(sequence)
+    result = played.run_room()
     heard = run_odometry(sequence, OdometryOptions(), threads=2, events=Events(lambda event: None))  # type: ignore[arg-type]
     model, entry = result.maps[0].reconstruction, result.maps[0]
     np.testing.assert_array_equal(model.point_rgb, heard.maps[0].reconstruction.point_rgb)
